@@ -1,0 +1,553 @@
+"""Off-policy Demo-EASE: DDPG with a demonstration buffer and masked behaviour cloning (`ag:d-ease-off`, `tab:reward`).
+
+    python ddpg_demoease.py --task p2p --quick                                 # a few minutes, to see it learn
+    python ddpg_demoease.py --task p2p --recipe robust --epochs 50             # 100,000 steps
+    python ddpg_demoease.py --task p2p --recipe paper                          # the paper's run: 500,000 steps
+    python ddpg_demoease.py --task p2p --num_demos 0 --lambda_bc 0             # plain DDPG
+    python ddpg_demoease.py --task p2p --seed 1 --resume                       # goes on where it was stopped
+
+Two recipes. `paper` is the algorithm as printed. `robust` adds four parts, each a flag of its own: LayerNorm in the
+critic, Bellman targets clipped to possible returns, L_O divided by |mean Q|, and a symmetry for the networks; its
+demonstrations come from the faster PID gains. README.md has the measured figures and the list of differences from the
+paper. A run is a folder, DATA_DIR/NAME: see logx.py.
+"""
+
+import json
+import math
+import signal
+import sys
+from copy import deepcopy
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from torch import nn
+from tqdm import tqdm
+
+import evaluate
+import gas
+import logx
+import pid_demo
+from kinova_env import TASKS
+from logx import flag
+
+# ---- flags -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Flags:
+    # the experiment
+    task: str = flag("p2p", choices=tuple(TASKS))
+    recipe: str | None = flag(None, "paper (as printed; the default) or robust (the default of --quick)",
+                              ("paper", "robust"))  # fmt: skip
+    num_demos: int | None = flag(None, "N_demos, episodes in B_d; 100 on p2p, 250 on p2po, 400 on pnp", low=0)
+    lambda_bc: float | None = flag(None, "lambda_BC (eq:loss_actor); 1.8 on p2p, 2 on p2po, 15 on pnp", low=0)
+    symmetry: str | None = flag(None, "none; gas: demonstrations of one partition mapped to K; so2: every sample turned "
+                                "by a random angle; canonical: the networks see the arm's own frame. paper: gas",
+                                ("none", "gas", "so2", "canonical"))  # fmt: skip
+    partitions: int = flag(4, "K", low=1)
+    gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
+    demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings")
+    seed: int = flag(0, low=0, high=2**32 - 1)
+    # length (tab:reward; 5 T steps an epoch is ours: the paper does not say)
+    epochs: int | None = flag(None, "N_ep; 250 on p2p, 500 on p2po, 250 on pnp", low=1)
+    steps_per_epoch: int | None = flag(None, "5 T", low=1)
+    max_ep_len: int | None = flag(None, "T; 400, 500, 800", low=1)
+    # the algorithm (tab:reward; start_steps and update_after: ours)
+    update_every: int | None = flag(None, "N_up, steps between blocks of as many updates; 20 on p2p, else T/20", low=1)
+    start_steps: int | None = flag(None, "uniformly random actions first; 2 T", low=0)
+    update_after: int | None = flag(None, "no updates before; T", low=0)
+    replay_size: int = flag(1_000_000, "N_o", low=1)
+    batch_size: int = flag(100, "of B_o", low=1)
+    demo_batch_size: int = flag(100, "of B_d", low=1)
+    gamma: float = flag(0.99, low=0, high=1)
+    act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
+    polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
+    pi_lr: float = flag(1e-3, "alpha_mu", low=0)
+    q_lr: float = flag(1e-3, "alpha_nu", low=0)
+    hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128 on p2p, 256 1024 256 on p2po, 512 512 256 on pnp",
+                                                low=1)  # fmt: skip
+    # the parts of the robust recipe (ours)
+    critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
+    clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
+    normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
+    # the run
+    name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
+    data_dir: str = flag("data/runs", "where run folders lie")
+    resume: bool = flag(False, "go on from the checkpoint, if there is one")
+    device: str = flag("cpu", choices=("cpu", "cuda"))
+    eval_every: int = flag(5, "epochs between test trials; 0 never", low=0)
+    eval_trials: int = flag(50, low=1)
+    checkpoint_every: int = flag(5, "epochs", low=1)
+    quick: bool = flag(False, "a few minutes: the robust recipe, 15 epochs, then test trials and a GIF of the agent")
+    quiet: bool = flag(False, "no progress bar and table")
+    tensorboard: bool = flag(False)
+
+
+BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P-O's schedule
+    "p2p": dict(max_ep_len=400, epochs=250, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
+    "p2po": dict(max_ep_len=500, epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
+    "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
+}
+BY_RECIPE = {
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
+}
+QUICK = dict(recipe="robust", epochs=15)
+
+
+def complete(flags):
+    """Fills in what the task and the recipe decide; exits with 2 where a flag is out of range."""
+    defaults = [QUICK] if flags.quick else []
+    recipe = flags.recipe or ("robust" if flags.quick else "paper")
+    for values in (*defaults, dict(recipe=recipe), BY_RECIPE[recipe], BY_TASK[flags.task]):
+        for key, value in values.items():
+            if getattr(flags, key) is None:
+                setattr(flags, key, value)
+    T = flags.max_ep_len
+    for key, value in dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T).items():
+        if getattr(flags, key) is None:
+            setattr(flags, key, value)
+    flags.hidden_sizes = tuple(flags.hidden_sizes)
+    logx.check_ranges(flags)
+    if flags.name is None:
+        flags.name = (
+            f"{flags.task}-ddpg-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}-seed{flags.seed}"
+        ) + ("-quick" if flags.quick else "")
+    if "/" in flags.name or flags.name in ("", ".", ".."):
+        logx.fail(f"--name {flags.name!r}: must be the name of one folder")
+    if flags.device == "cuda" and not torch.cuda.is_available():
+        logx.fail("--device cuda: torch sees no GPU here; use --device cpu")
+    return flags
+
+
+# ---- replay buffers (B_o, B_d) ---------------------------------------------------------------------------------------
+
+
+class ReplayBuffer:
+    """Transitions {s, a, r, s', zeta} in a ring, one row each, so that a batch is one gather."""
+
+    def __init__(self, obs_dim, size):
+        self.rows = torch.zeros(size, 2 * obs_dim + 6)
+        self.next, self.filled, self.size = 0, 0, size
+
+    def store(self, s, a, r, s2, terminated):
+        row = np.concatenate((s, a, (r,), s2, (terminated,)), dtype=np.float32, casting="same_kind")
+        self.rows[self.next] = torch.from_numpy(row)
+        self.next, self.filled = (self.next + 1) % self.size, min(self.filled + 1, self.size)
+
+    def sample(self, batch_size, batches):
+        """Rows (s, a, r, s', zeta) drawn uniformly, (batches, batch_size, width); zeta is 1 on a true end only."""
+        i = torch.randint(self.filled, (batches * min(batch_size, self.filled),))
+        return self.rows[i].view(batches, -1, self.rows.shape[1])
+
+    def state(self):
+        return {"rows": self.rows[: self.filled], "next": self.next}
+
+    def load(self, state):
+        self.filled, self.next = len(state["rows"]), state["next"]
+        self.rows[: self.filled] = state["rows"]
+
+
+def turn(rows, widths):
+    """Rows of a batch, each with its world turned by a random angle of its own (SO(2), gas.rotate)."""
+    s, a, r, s2, zeta = rows.split(widths, dim=-1)
+    angle = 2 * math.pi * torch.rand(rows.shape[:-1])
+    return torch.cat((gas.rotate(s, angle), gas.psi(a, angle), r, gas.rotate(s2, angle), zeta), dim=-1)
+
+
+# ---- networks --------------------------------------------------------------------------------------------------------
+
+
+def mlp(sizes, layernorm=False):
+    layers = []
+    for n_in, n_out in zip(sizes[:-2], sizes[1:-1], strict=True):
+        layers += [nn.Linear(n_in, n_out), *([nn.LayerNorm(n_out)] if layernorm else []), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
+
+
+class ActorCritic(nn.Module):
+    """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R."""
+
+    def __init__(self, obs_dim, hidden_sizes, critic_layernorm):
+        super().__init__()
+        self.u = mlp([obs_dim, *hidden_sizes, 4])  # pre-tanh
+        self.q = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
+
+    def pi(self, s):
+        return torch.tanh(self.u(s))
+
+    def Q(self, s, a):
+        return self.q(torch.cat((s, a), dim=-1)).squeeze(-1)
+
+
+# ---- losses ----------------------------------------------------------------------------------------------------------
+
+
+def loss_C(Q_s_a, y):
+    """ag:d-ease-off, with the stored action a_t where it prints pi(s_t)."""
+    return ((Q_s_a - y) ** 2).mean()
+
+
+def loss_O(Q_s_pi, normalize_q):
+    """ag:d-ease-off; normalize_q (ours) keeps its scale, so that lambda_BC means the same throughout training."""
+    mean_Q = Q_s_pi.mean()
+    return -mean_Q / mean_Q.abs().detach().clamp(min=1e-3) if normalize_q else -mean_Q
+
+
+def mask(Q_demo, Q_own):
+    """M_t, eq:mask_q: 1 where the demonstrated action is better than the policy's by the critic."""
+    return (Q_own < Q_demo).float()
+
+
+def loss_BC(a_demo, a_hat, M):
+    """eq:bc_gain, averaged over the batch and the 4 actions."""
+    return (M.unsqueeze(-1) * (a_demo - a_hat) ** 2).mean()
+
+
+def loss_A(L_O, L_BC, lambda_bc):
+    """eq:loss_actor."""
+    return L_O + lambda_bc * L_BC
+
+
+# ---- update ----------------------------------------------------------------------------------------------------------
+
+
+def flatten(module):
+    """Puts the module's weights, and their gradients, into one vector each: the optimiser and the target update then
+    cost one operation instead of one a layer. Returns the vector, a Parameter."""
+    flat = nn.Parameter(torch.cat([p.detach().flatten() for p in module.parameters()]))
+    flat.grad = torch.zeros_like(flat)
+    i = 0
+    for p in module.parameters():
+        p.data, p.grad = flat.data[i : i + p.numel()].view_as(p), flat.grad[i : i + p.numel()].view_as(p)
+        i += p.numel()
+    return flat
+
+
+class Learner:
+    """Networks, targets, optimisers, and the gradient step of ag:d-ease-off."""
+
+    def __init__(self, flags, obs_dim):
+        self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1)
+        cuda = flags.device == "cuda"
+        self.net = ActorCritic(obs_dim, flags.hidden_sizes, flags.critic_layernorm).to(flags.device)
+        self.target = deepcopy(self.net)
+        self.mu, self.nu = flatten(self.net.u), flatten(self.net.q)
+        self.mu_target, self.nu_target = flatten(self.target.u), flatten(self.target.q)
+        self.pi_opt = torch.optim.Adam([self.mu], lr=flags.pi_lr, fused=True, capturable=cuda)
+        self.q_opt = torch.optim.Adam([self.nu], lr=flags.q_lr, fused=True, capturable=cuda)
+        self.actor = deepcopy(self.net.u).cpu() if cuda else self.net.u  # what acts, on the CPU
+        self.return_range = (-4.0, TASKS[flags.task].return_max)
+        self.graph, self.eager_updates = None, 0
+
+    def block(self, B_o, B_d):
+        """`update_every` updates (B_d None: no behaviour cloning). Returns the last one's measurements, floats by name."""
+        f = self.flags
+        n = f.update_every
+        rows, rows_demo = B_o.sample(f.batch_size, n), B_d.sample(f.demo_batch_size, n) if B_d else None
+        if f.symmetry == "so2":  # each transition turned by an angle of its own
+            rows = turn(rows, self.widths)
+            rows_demo = turn(rows_demo, self.widths) if B_d else None
+        rows = rows.to(f.device)
+        batches = [(o, d) for o, d in zip(rows, rows_demo.to(f.device) if B_d else [None] * n, strict=True)]
+        for batch in batches:
+            measured = self.replay(*batch) if f.device == "cuda" else self.update(*batch)
+        if f.device == "cuda":
+            with torch.no_grad():
+                for p, q in zip(self.actor.parameters(), self.net.u.parameters(), strict=True):
+                    p.copy_(q)
+        return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
+
+    def update(self, rows, rows_demo):
+        """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). Returns 0-d tensors by name."""
+        f = self.flags
+        s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
+        s_demo, a_demo = (s[:0], a[:0]) if rows_demo is None else rows_demo.split(self.widths, dim=-1)[:2]
+        n, n_demo = len(s), len(s_demo)
+
+        with torch.no_grad():
+            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
+            if f.clip_target:
+                y = y.clamp(*self.return_range)
+        Q_s_a = self.net.Q(s, a)
+        L_C = loss_C(Q_s_a, y)
+
+        u = self.net.u(torch.cat((s, s_demo)))
+        a_pi, a_hat = torch.tanh(u).split((n, n_demo))
+        L_O = L_A = loss_O(self.net.Q(s, a_pi), f.normalize_q)
+        L_BC = M = L_O.new_full((), math.nan)
+        if n_demo:
+            with torch.no_grad():
+                Q_own, Q_demo = self.net.Q(torch.cat((s_demo, s_demo)), torch.cat((a_hat, a_demo))).chunk(2)
+            M = mask(Q_demo, Q_own)
+            L_BC = loss_BC(a_demo, a_hat, M)
+            L_A = loss_A(L_O, L_BC, f.lambda_bc)
+
+        self.mu.grad.zero_()
+        self.nu.grad.zero_()
+        L_C.backward(inputs=list(self.net.q.parameters()))
+        L_A.backward(inputs=list(self.net.u.parameters()))
+        self.q_opt.step()
+        self.pi_opt.step()
+        with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
+            self.mu_target.lerp_(self.mu, 1 - f.polyak)
+            self.nu_target.lerp_(self.nu, 1 - f.polyak)
+            return {
+                "L_O": L_O.detach(),
+                "L_BC": L_BC.detach(),
+                "L_C": L_C.detach(),
+                "L_A": L_A.detach(),
+                "mask_fraction": M.mean(),
+                "Q_mean": Q_s_a.mean(),
+                "Q_max": Q_s_a.max(),
+                "pretanh_own": u[:n].abs().mean(),
+                "pretanh_demo": u[n:].abs().mean(),
+                # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
+                "bc_relative_error": ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
+            }
+
+    def replay(self, rows, rows_demo):
+        """update() on a GPU, recorded once and replayed: launching its hundreds of kernels one by one takes longer."""
+        if self.graph is None and self.eager_updates < 3:  # the first few warm up what may not be recorded
+            self.eager_updates += 1
+            self.fixed = [x if x is None else x.clone() for x in (rows, rows_demo)]
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                measured = self.update(*self.fixed)
+            torch.cuda.current_stream().wait_stream(stream)
+            return measured
+        if len(rows) != len(self.fixed[0]):
+            return self.update(rows, rows_demo)
+        if self.graph is None:
+            self.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.measured = self.update(*self.fixed)
+        for fixed, new in zip(self.fixed, (rows, rows_demo), strict=True):
+            if new is not None:
+                fixed.copy_(new)
+        self.graph.replay()
+        return self.measured
+
+    def state(self):
+        return {
+            "net": self.net.state_dict(),
+            "target": self.target.state_dict(),
+            "pi_opt": self.pi_opt.state_dict(),
+            "q_opt": self.q_opt.state_dict(),
+        }
+
+    def load(self, state):
+        for name, part in state.items():
+            getattr(self, name).load_state_dict(part)
+        self.actor.load_state_dict(self.net.u.state_dict())
+
+    def policy(self):
+        """What policy.pt holds: see evaluate.Policy."""
+        f = self.flags
+        return {
+            "task": f.task,
+            "symmetry": f.symmetry,
+            "sizes": [self.net.u[0].in_features, *f.hidden_sizes, 4],
+            "output": "tanh",
+            "weights": {name: w.detach().clone() for name, w in self.actor.state_dict().items()},
+        }
+
+
+# ---- training loop ---------------------------------------------------------------------------------------------------
+
+
+def demonstrations(flags):
+    """(arrays of N_demos episodes, real environment steps they took): read from --demos, else recorded."""
+    if not flags.num_demos:
+        return None, 0
+    if flags.demos is None:
+        settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+        return pid_demo.record(flags.task, flags.num_demos, **settings, quiet=flags.quiet)
+    try:
+        demos, meta = pid_demo.load_demos(flags.demos, flags.task)
+    except ValueError as error:
+        logx.fail(f"--demos {error}")
+    if flags.symmetry == "gas" and meta["symmetry"] != "gas":
+        demos = gas.aggregate(demos, flags.partitions)
+    if len(demos["length"]) < flags.num_demos:
+        logx.fail(f"--demos {flags.demos}: gives {len(demos['length'])} episodes, fewer than --num_demos {flags.num_demos}")
+    first = demos["episode"] < flags.num_demos
+    return {name: rows[first] for name, rows in demos.items() if len(rows) == len(first)}, meta["env_steps"]
+
+
+def train(flags):
+    """Runs ag:d-ease-off to the end, or on from the checkpoint. Returns the run's folder."""
+    config = asdict(flags) | {"algo": "ddpg"}
+    run = logx.Run(Path(flags.data_dir) / flags.name, config, flags.resume, flags.tensorboard)
+    torch.manual_seed(flags.seed)
+    rng = np.random.default_rng(flags.seed)  # exploration
+    make = dict(max_episode_steps=flags.max_ep_len, disable_env_checker=True)
+    env = gymnasium.make(TASKS[flags.task].env_id, stage="train", **make)
+    eval_env = gymnasium.make(TASKS[flags.task].env_id, stage="test", **make)
+    obs_dim = env.observation_space.shape[0]
+    view = gas.canonical if flags.symmetry == "canonical" else lambda obs: obs
+    learner = Learner(flags, obs_dim)
+    B_o, B_d = ReplayBuffer(obs_dim, flags.replay_size), None
+    total_steps = flags.epochs * flags.steps_per_epoch
+
+    if run.checkpoint:
+        state = run.checkpoint
+        loop = json.loads(state["loop"])
+        if loop["t"] >= total_steps:
+            print(f"{run.folder}: finished, {loop['t']} steps; more with --epochs")
+            return run.folder
+        learner.load(state["learner"])
+        B_o.load(state["B_o"])
+        if state["B_d"] is not None:
+            B_d = ReplayBuffer(obs_dim, len(state["B_d"]["rows"]))
+            B_d.load(state["B_d"])
+        torch.set_rng_state(state["torch_rng"])
+        if flags.device == "cuda":
+            torch.cuda.set_rng_state(state["cuda_rng"])
+        rng.bit_generator.state = loop["rng"]
+        # The unfinished episode is played again: the simulator's state is not enough to go on exactly.
+        env.unwrapped.np_random.bit_generator.state = loop["episode_rng"]
+        s, _ = env.reset()
+        actions = list(state["episode_actions"].numpy())
+        for a in actions:
+            s, *_ = env.step(a)
+    else:
+        demos, demo_env_steps = demonstrations(flags)
+        if demos:
+            if len(demos["rew"]) > flags.replay_size:
+                logx.fail(f"--replay_size {flags.replay_size}: holds less than the {len(demos['rew'])} demonstrated steps")
+            B_d = ReplayBuffer(obs_dim, len(demos["rew"]))
+            columns = ("obs", "act", "rew", "obs2", "terminated")
+            for s, a, r, s2, terminated in zip(*(demos[name] for name in columns), strict=True):
+                transition = (view(s), a, r, view(s2), terminated)
+                B_d.store(*transition)
+                B_o.store(*transition)  # both buffers
+        loop = {"t": 0, "episodes": 0, "demo_env_steps": demo_env_steps, "ep_ret": 0.0, "epoch_log": []}
+        loop["epoch_episodes"] = []
+        env.unwrapped.reset(seed=flags.seed)
+        loop["episode_rng"] = env.unwrapped.np_random.bit_generator.state
+        s, _ = env.reset()
+        actions = []
+
+    def save():
+        loop["rng"] = rng.bit_generator.state
+        run.save(
+            {
+                "learner": learner.state(),
+                "B_o": B_o.state(),
+                "B_d": B_d.state() if B_d else None,
+                "torch_rng": torch.get_rng_state(),
+                "cuda_rng": torch.cuda.get_rng_state() if flags.device == "cuda" else None,
+                "episode_actions": torch.from_numpy(np.array(actions, dtype=np.float32).reshape(-1, 4)),
+                "loop": json.dumps(loop),
+            },
+            config,
+        )
+        logx.atomic_write(run.folder / "policy.pt", lambda file: torch.save(learner.policy(), file))
+
+    stopped = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, frame: stopped.append(number))
+    bar = tqdm(total=total_steps, initial=loop["t"], unit="step", disable=flags.quiet, smoothing=0.02, mininterval=1)
+    if not flags.quiet:
+        print(f"{run.folder}: {total_steps} steps, {loop['demo_env_steps']} of the demonstrator; Q at most "
+              f"{TASKS[flags.task].return_max:g}\n" + TABLE.format(*TABLE_COLUMNS))  # fmt: skip
+    while loop["t"] < total_steps:
+        # act, step, store, advance
+        if loop["t"] < flags.start_steps:
+            a = rng.uniform(-1, 1, 4).astype(np.float32)
+        else:
+            with torch.inference_mode():
+                a = torch.tanh(learner.actor(torch.from_numpy(view(s)))).numpy()
+            a = np.clip(a + flags.act_noise * rng.standard_normal(4), -1, 1).astype(np.float32)
+        s2, r, terminated, truncated, info = env.step(a)
+        B_o.store(view(s), a, r, view(s2), terminated)  # zeta: a timeout is no end to bootstrapping
+        s = s2
+        actions.append(a)
+        loop["t"] += 1
+        loop["ep_ret"] += r
+        t = loop["t"]
+
+        # reset
+        if terminated or truncated:
+            loop["episodes"] += 1
+            episode = {
+                "episode": loop["episodes"],
+                "env_steps": t,
+                "return": loop["ep_ret"],
+                "length": len(actions),
+                "success": int(info["is_success"]),
+                "collision": info["collision"],
+            }
+            run.write("episodes", episode)
+            loop["epoch_episodes"].append([episode["return"], episode["length"], episode["success"]])
+            loop["episode_rng"] = env.unwrapped.np_random.bit_generator.state
+            s, _ = env.reset()
+            actions, loop["ep_ret"] = [], 0.0
+
+        # update
+        if t >= flags.update_after and t % flags.update_every == 0:
+            measured = learner.block(B_o, B_d)
+            loop["epoch_log"].append(list(measured.values()))
+            if not math.isfinite(measured["L_A"] + measured["L_C"]):
+                logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))
+                print(f"{run.folder}: NaN in a loss at step {t}; networks saved to nan.pt", file=sys.stderr)
+                raise SystemExit(3)
+            bar.update(t - bar.n)
+
+        # log
+        if t % flags.steps_per_epoch == 0:
+            epoch = t // flags.steps_per_epoch
+            row = {"epoch": epoch, "env_steps": t, "demo_env_steps": loop["demo_env_steps"]}
+            if loop["epoch_episodes"]:
+                row |= zip(("EpRet", "EpLen", "Success"), np.mean(loop["epoch_episodes"], axis=0).tolist(), strict=True)
+            if loop["epoch_log"]:
+                row |= zip(measured, np.mean(loop["epoch_log"], axis=0).tolist(), strict=True)
+            if flags.eval_every and (epoch % flags.eval_every == 0 or t == total_steps):
+                policy = evaluate.Policy(learner.policy())
+                rows = [evaluate.trial(eval_env, policy, i)[0] for i in range(flags.eval_trials)]
+                row["eval_success"] = np.mean([row["success"] for row in rows])
+                row["eval_return"] = np.mean([row["return"] for row in rows])
+            row["seconds"] = run.seconds()
+            run.write("progress", row)
+            loop["epoch_log"], loop["epoch_episodes"] = [], []
+            if not flags.quiet:
+                bar.write(TABLE.format(*(f"{row.get(c, math.nan):.4g}" for c in TABLE_COLUMNS)))
+            if epoch % flags.checkpoint_every == 0 or t == total_steps:
+                save()
+        if stopped:
+            save()
+            bar.close()
+            print(f"{run.folder}: stopped at step {t}, state saved; go on with --resume", file=sys.stderr)
+            raise SystemExit(130)
+    bar.close()
+    env.close()
+    eval_env.close()
+    return run.folder
+
+
+TABLE_COLUMNS = ("epoch", "env_steps", "EpRet", "Success", "EpLen", "L_BC", "mask_fraction", "Q_mean", "Q_max",
+                 "pretanh_own", "bc_relative_error", "eval_success")  # fmt: skip
+TABLE = "{:>5} {:>9} {:>7} {:>7} {:>6} {:>9} {:>13} {:>7} {:>6} {:>11} {:>17} {:>12}"
+
+
+def main():
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    flags = complete(logx.parse_flags(Flags, __doc__))
+    folder = train(flags)
+    if flags.quick:
+        results = {str(folder): evaluate.run_trials(flags.task, folder, 100, quiet=flags.quiet)}
+        evaluate.write_csv(folder / "evaluation.csv", results[str(folder)])
+        results[f"PID, {flags.gains} gains"] = evaluate.run_trials(flags.task, flags.gains, 100, quiet=flags.quiet)
+        evaluate.print_table(results)
+        evaluate.show(flags.task, folder, folder / "agent.gif")
+        print(f"wrote {folder / 'agent.gif'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""A run's folder: what was asked (config.json), its curves (episodes.csv, progress.csv) and its checkpoint.
+
+    flags = logx.parse_flags(Flags, __doc__)          # a dataclass of typed flags, as a command line
+    run = logx.Run(folder, config, resume=flags.resume)
+    run.write("episodes", {...}); run.write("progress", {...}); run.save({...})
+
+What is on disk is always whole: files are written beside their place, fsynced and renamed, and on a resume the curves
+are cut back to the checkpoint they belong to, so that a killed and resumed run equals one that was never killed.
+"""
+
+import argparse
+import csv
+import dataclasses
+import fcntl
+import json
+import os
+import pickle
+import platform
+import subprocess
+import sys
+import time
+import types
+import typing
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+
+EPISODES = "episode,env_steps,return,length,success,collision".split(",")
+PROGRESS = (
+    "epoch,env_steps,demo_env_steps,seconds,EpRet,EpLen,Success,L_O,L_BC,L_C,L_A,mask_fraction,Q_mean,Q_max,"
+    "pretanh_own,pretanh_demo,bc_relative_error,eval_success,eval_return"
+).split(",")
+
+
+def fail(message):
+    """Bad input: one line on standard error, exit code 2."""
+    print(f"{Path(sys.argv[0]).name}: error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def parse_flags(cls, doc, argv=None):
+    """The command line of a dataclass: a field is a flag, its annotation the type, metadata the help and the choices.
+
+    `X | None` fields default to what the task or recipe says; bools become --flag and --no-flag; tuples take spaces.
+    """
+    parser = argparse.ArgumentParser(
+        description=doc, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for field in dataclasses.fields(cls):
+        kind = typing.get_type_hints(cls)[field.name]
+        if isinstance(kind, types.UnionType):
+            kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        options = {"default": field.default, "help": field.metadata.get("help")}
+        if kind is bool:
+            options["action"] = argparse.BooleanOptionalAction
+        elif typing.get_origin(kind) is tuple:
+            options |= {"type": int, "nargs": "+"}
+        else:
+            options |= {"type": kind, "choices": field.metadata.get("choices")}
+        parser.add_argument(f"--{field.name}", **options)
+    return cls(**vars(parser.parse_args(argv)))
+
+
+def flag(default, help=None, choices=None, low=None, high=None):
+    """A dataclass field that is a command-line flag; low and high are the smallest and largest allowed values."""
+    return dataclasses.field(default=default, metadata=dict(help=help, choices=choices, low=low, high=high))
+
+
+def check_ranges(flags):
+    """Exits with 2 and a line that names the flag where a number is outside what its field allows."""
+    for field in dataclasses.fields(flags):
+        low, high = field.metadata.get("low"), field.metadata.get("high")
+        value = getattr(flags, field.name)
+        for x in value if isinstance(value, (tuple, list)) else (value,):
+            if x is None or isinstance(x, (bool, str)):
+                continue
+            if x != x or (low is not None and x < low) or (high is not None and x > high):
+                allowed = " and ".join(
+                    f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None
+                )
+                fail(f"--{field.name} {x}: must be {allowed or 'a number'}")
+
+
+def atomic_write(path, write):
+    """Calls write(file) on a binary file beside `path`, then puts it in place whole (fsync, rename)."""
+    temporary = Path(f"{path}.part")
+    with open(temporary, "wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def versions():
+    """What a run was made with: packages, Python, machine, git commit ("-dirty" with uncommitted changes)."""
+    made_with = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in ("torch", "numpy", "gymnasium", "pybullet"):
+        try:
+            made_with[package] = version(package)
+        except PackageNotFoundError:
+            made_with[package] = "unknown"
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    commit = subprocess.run(git, capture_output=True, text=True)
+    return made_with | {"git_commit": commit.stdout.strip() or "unknown"}
+
+
+def load_torch(path):
+    """torch.load of tensors and plain types only. Raises ValueError with what is wrong with the file."""
+    try:
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError) as error:
+        raise ValueError(f"{path}: not a whole file of tensors ({str(error).splitlines()[0]})") from None
+
+
+class Run:
+    """One run folder. Another process that holds it, or a folder of an earlier run without `resume`, exits with 2."""
+
+    def __init__(self, folder, config, resume=False, tensorboard=False):
+        self.folder = Path(folder)
+        started = (self.folder / "config.json").exists()
+        if self.folder.exists() and not self.folder.is_dir():
+            fail(f"--name {self.folder.name}: {self.folder} is a file")
+        if started and not resume:
+            fail(f"--name {self.folder.name}: {self.folder} holds a run; go on with --resume, or choose another --name")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = open(self.folder / "lock", "w")  # noqa: SIM115 - held until the process ends
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fail(f"--name {self.folder.name}: another process is running {self.folder}")
+        except OSError as error:
+            fail(f"--data_dir {self.folder.parent}: cannot write there ({error.strerror})")
+        self.checkpoint = None
+        if (self.folder / "checkpoint.pt").exists():
+            try:
+                self.checkpoint = load_torch(self.folder / "checkpoint.pt")
+                self._same_run(config)
+            except ValueError as error:
+                fail(f"--resume: {error}")
+        self._files = {}
+        for name, columns in (("episodes", EPISODES), ("progress", PROGRESS)):
+            path = self.folder / f"{name}.csv"
+            if self.checkpoint:
+                os.truncate(path, self.checkpoint["log_bytes"][name])  # rows after the checkpoint are made again
+            else:
+                path.write_text(",".join(columns) + "\n")
+            self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
+        text = json.dumps(config | {"command": sys.argv, "versions": versions()}, indent=1).encode()
+        atomic_write(self.folder / "config.json", lambda file: file.write(text))
+        self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
+        self._begin = time.monotonic()
+        self._board = None
+        if tensorboard:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError:
+                fail("--tensorboard: the tensorboard package is not installed (pip install tensorboard)")
+            self._board = SummaryWriter(self.folder)
+
+    def _same_run(self, config):
+        """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
+        free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
+                "eval_trials", "device"}  # fmt: skip
+        before = json.loads(self.checkpoint["config"])
+        for key in sorted(set(config) | set(before)):
+            if key not in free and json.dumps(config.get(key)) != json.dumps(before.get(key)):
+                raise ValueError(
+                    f"{self.folder / 'checkpoint.pt'}: made with --{key} {before.get(key)}, not {config.get(key)}"
+                )
+
+    def seconds(self):
+        """Wall-clock seconds of the run, earlier parts included."""
+        return self.seconds_before + time.monotonic() - self._begin
+
+    def write(self, name, row):
+        """Appends a row (dict by column; None and NaN are left blank) to "episodes" or "progress"."""
+        columns = EPISODES if name == "episodes" else PROGRESS
+        values = [row.get(column) for column in columns]
+        csv.writer(self._files[name], lineterminator="\n").writerow(
+            ["" if v is None or v != v else f"{v:.9g}" if isinstance(v, float) else v for v in values]
+        )
+        if self._board and name == "progress":
+            for column, v in zip(columns, values, strict=True):
+                if v is not None:
+                    self._board.add_scalar(column, v, row["env_steps"])
+
+    def save(self, state, config):
+        """Writes checkpoint.pt: `state` (tensors and plain types), and what a resume needs of the folder itself."""
+        sizes = {}
+        for name, file in self._files.items():
+            file.flush()
+            os.fsync(file.fileno())
+            sizes[name] = os.fstat(file.fileno()).st_size
+        state = state | {"log_bytes": sizes, "seconds": self.seconds(), "config": json.dumps(config)}
+        atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))

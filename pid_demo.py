@@ -1,0 +1,216 @@
+"""The PID demonstrator (`eq:pid`, `sec:demo`): watch it, measure it, record its episodes.
+
+    python pid_demo.py --task p2p --gif pid.gif                     # a few episodes as a GIF, no display needed
+    python pid_demo.py --task p2p --watch                           # the same in PyBullet's window
+    python pid_demo.py --task p2p --trials 500 --stage test         # success, length, return, effort
+    python pid_demo.py --task p2p --record 100 --out demos.npz      # episodes for ddpg_demoease.py --demos demos.npz
+
+The controller drives joint angles to the inverse kinematics of Cartesian set points; the action is the reference joint
+velocity in the environment's normalised units. Gains: `authors` is the slow controller that reproduces the paper's
+lengths, `fast` reaches in under half the time (see the README for both, measured).
+"""
+
+import argparse
+import json
+import os
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from tqdm import tqdm
+
+import gas
+from kinova_env import STAGES, TASKS, TIME_STEP, postures, wrap
+
+GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
+
+
+class PID:
+    """a_t = K_P q~ + K_I integral(q~) + K_D dq~/dt (`eq:pid`), q~ = q_sp - q in rad, for all four joints.
+
+    env: a KinovaEnv or a wrapper of one; a new episode is noticed by itself. gains: a name in GAINS or (K_P, K_D, K_I).
+    `act()` returns the action (4,) float32 in [-1, 1]. Where K_I > 0, a joint's integral rests while its action is
+    saturated (anti-windup).
+    """
+
+    def __init__(self, env, gains="authors"):
+        self.env = env.unwrapped
+        self.K_P, self.K_D, self.K_I = GAINS[gains] if isinstance(gains, str) else gains
+        self._episode = None
+
+    def _set_points(self):
+        """Joint set points of the episode, in order (`sec:demo`): position only, the posture nearest to the present."""
+        q = np.array(self.env.q)
+        found = postures(self.env.goal)
+        error = np.abs(wrap(found[:, 0] - q[0])) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1)
+        return [found[np.argmin(error)]]
+
+    def act(self):
+        if self._episode != self.env.episode:
+            self._episode = self.env.episode
+            self._q_sp = self._set_points()[0]
+            self._integral = np.zeros(4)
+        q_tilde = self._q_sp - self.env.q
+        q_tilde[0] = wrap(q_tilde[0])  # joint 1 turns without end: the shortest way round
+        integral = self._integral + q_tilde * TIME_STEP
+        a = self.K_P * q_tilde + self.K_I * integral - self.K_D * np.asarray(self.env.q_dot)
+        self._integral = np.where(np.abs(a) < 1, integral, self._integral)
+        return np.clip(a, -1, 1).astype(np.float32)
+
+
+def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="none", stage="demo", quiet=True):
+    """Demonstration episodes (`sec:demo`), failed ones included.
+
+    symmetry "gas": ceil(num_demos / partitions) real episodes in partition 0, each mapped to the others, the surplus
+    dropped; any other: num_demos real episodes in uniformly drawn partitions. Returns (demos, env_steps): the arrays of
+    DESIGN's demonstration file, and how many steps of the environment they took.
+    """
+    env = gymnasium.make(TASKS[task].env_id, stage=stage, partitions=partitions, disable_env_checker=True)
+    pid = PID(env, gains)
+    rows = {name: [] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")}
+    episodes = {name: [] for name in ("partition", "success", "length", "return")}
+    real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
+    env.reset(seed=seed)
+    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
+        s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
+        total, length, terminated, truncated = 0.0, 0, False, False
+        while not (terminated or truncated):
+            a = pid.act()
+            s2, r, terminated, truncated, info = env.step(a)
+            for column, value in zip(rows.values(), (s, a, r, s2, terminated, truncated, n), strict=True):
+                column.append(value)
+            s, total, length = s2, total + r, length + 1
+        of_episode = (info.get("partition", 0), info["is_success"], length, total)
+        for column, value in zip(episodes.values(), of_episode, strict=True):
+            column.append(value)
+    width = env.observation_space.shape[0]
+    env.close()
+    dtypes = dict(obs="f4", act="f4", rew="f8", obs2="f4", terminated="?", truncated="?", episode="i8")
+    dtypes |= {"partition": "i8", "success": "?", "length": "i8", "return": "f8"}
+    demos = {name: np.array(column, dtype=dtypes[name]) for name, column in (rows | episodes).items()}
+    for name, columns in (("obs", width), ("obs2", width), ("act", 4)):
+        demos[name] = demos[name].reshape(-1, columns)  # also where there is no row
+    steps = len(demos["rew"])
+    return (gas.aggregate(demos, partitions, num_demos) if symmetry == "gas" else demos), steps
+
+
+def load_demos(path, task):
+    """The arrays of a demonstration file and its `meta`. Raises ValueError with what is wrong with the file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            demos = {name: file[name] for name in file.files}
+        meta = json.loads(str(demos.pop("meta")))
+        lengths = {len(demos[name]) for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")}
+        if len(lengths) != 1 or demos["length"].sum() != lengths.pop() or not np.all(np.isfinite(demos["obs"])):
+            raise ValueError("its arrays do not fit together")
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (OSError, ValueError, KeyError, EOFError, __import__("zipfile").BadZipFile) as error:
+        raise ValueError(f"{path}: not a demonstration file of pid_demo.py --record ({error})") from None
+    if meta["task"] != task:
+        raise ValueError(f"{path}: recorded on task {meta['task']}, not {task}")
+    return demos, meta
+
+
+def film(env, act, path, episodes=3, seed=0, every=4):
+    """Writes a GIF of `act(obs)` on an env with render_mode "rgb_array", one frame in `every` steps, in real time."""
+    from PIL import Image
+
+    frames = []
+    for n in range(episodes):
+        s, _ = env.reset(seed=seed + n)
+        done, t = False, 0
+        while not done:
+            if t % every == 0:
+                frames.append(env.render())
+            s, _, terminated, truncated, _ = env.step(act(s))
+            done, t = terminated or truncated, t + 1
+        frames += [env.render()] * 10  # a rest at the end
+    images = [Image.fromarray(frame).quantize(64) for frame in frames]
+    temporary = f"{path}.part"
+    images[0].save(
+        temporary, "GIF", save_all=True, append_images=images[1:], duration=int(1000 * TIME_STEP * every), loop=0
+    )
+    os.replace(temporary, path)
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--task", choices=TASKS, default="p2p")
+    job = parser.add_mutually_exclusive_group(required=True)
+    job.add_argument("--record", type=int, metavar="N", help="record N episodes into --out")
+    job.add_argument("--trials", type=int, metavar="N", help="run N episodes and print the mean success, length, ...")
+    job.add_argument("--watch", action="store_true", help="three episodes in PyBullet's window")
+    job.add_argument("--gif", metavar="FILE", help="three episodes into a GIF")
+    parser.add_argument("--out", metavar="FILE", help="the .npz of --record")
+    parser.add_argument("--gains", choices=GAINS, default="authors")
+    for name, i in (("K_P", 0), ("K_D", 1), ("K_I", 2)):
+        parser.add_argument(f"--{name}", type=float, help=f"instead of that of --gains ({GAINS['authors'][i]})")
+    parser.add_argument("--stage", choices=STAGES, default="demo")
+    parser.add_argument("--symmetry", choices=("none", "gas"), default="none", help="gas: record one partition, map it")
+    parser.add_argument("--partitions", type=int, default=4, metavar="K")
+    parser.add_argument("--seed", type=int, default=0)
+    flags = parser.parse_args()
+    for name in ("record", "trials", "partitions"):
+        if getattr(flags, name) is not None and getattr(flags, name) < 1:
+            parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
+    if flags.seed < 0:
+        parser.error(f"--seed {flags.seed}: must be 0 or more")
+    if (flags.record is None) != (flags.out is None):
+        parser.error("--record and --out: give both or neither")
+    if flags.symmetry == "gas" and flags.stage != "demo":
+        parser.error(f"--symmetry gas: needs --stage demo, not {flags.stage}")
+    for name in ("out", "gif"):
+        path = getattr(flags, name)
+        if path and not Path(path).absolute().parent.is_dir():
+            parser.error(f"--{name} {path}: its folder does not exist")
+    gains = [
+        own if own is not None else named
+        for own, named in zip((flags.K_P, flags.K_D, flags.K_I), GAINS[flags.gains], strict=True)
+    ]
+    if min(gains) < 0 or not np.all(np.isfinite(gains)):
+        parser.error(f"--K_P --K_D --K_I {gains}: must be finite and not negative")
+
+    if flags.watch or flags.gif:
+        mode = "human" if flags.watch else "rgb_array"
+        size = dict(width=480, height=360)
+        try:
+            env = gymnasium.make(TASKS[flags.task].env_id, stage=flags.stage, partitions=flags.partitions,
+                                 render_mode=mode, **size)  # fmt: skip
+        except ValueError as error:
+            parser.error(f"--watch: {error}")
+        pid = PID(env, gains)
+        if flags.gif:
+            film(env, lambda s: pid.act(), flags.gif, seed=flags.seed)
+            print(f"wrote {flags.gif}")
+        else:
+            for n in range(3):
+                env.reset(seed=flags.seed + n)
+                while not any(env.step(pid.act())[2:4]):
+                    pass
+        env.close()
+        return
+
+    settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+    demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
+    won = demos["success"]
+    print(
+        f"{flags.task} {flags.stage}, K_P K_D K_I = {gains}: {len(won)} episodes, {steps} environment steps\n"
+        f"success {100 * won.mean():.1f} %, length of the successful {demos['length'][won].mean() if won.any() else np.nan:.0f} "
+        f"steps, return {demos['return'].mean():.2f}, mean |a| {np.abs(demos['act']).mean():.3f}"
+    )
+    if flags.record:
+        meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))
+        temporary = f"{flags.out}.part"
+        with open(temporary, "wb") as file:
+            np.savez_compressed(file, **demos, meta=np.array(meta))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, flags.out)
+        print(f"wrote {flags.out}")
+
+
+if __name__ == "__main__":
+    main()

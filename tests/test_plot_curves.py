@@ -1,0 +1,372 @@
+"""plot_curves.py: the metrics on curves whose numbers follow by hand, which runs are read, and what bad input says."""
+import csv
+import gzip
+import io
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plot_curves
+from plot_curves import interval, over_seeds, training_metrics
+
+CONFIG = {"task": "p2p", "algo": "ddpg", "recipe": "robust", "num_demos": 100, "lambda_bc": 1.8, "symmetry": "so2",
+          "seed": 0, "epochs": 2, "steps_per_epoch": 2000, "quick": False}
+
+
+@pytest.fixture(autouse=True)
+def folders(tmp_path, monkeypatch):
+    """The default folders lie in an empty place, so that no test sees or writes real results."""
+    for name in ("RESULTS", "RUNS", "FIGURES"):
+        monkeypatch.setattr(plot_curves, name, tmp_path / name.lower())
+
+
+def write_run(folder, returns=(1.0,) * 60, steps=4000, compress=False, **config):
+    """A run folder like a training script's; `steps`: environment steps after the last epoch in progress.csv."""
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(CONFIG | config))
+    rows = "".join(f"{i},{20 * i},{value},20,0,\n" for i, value in enumerate(returns, start=1))
+    tables = {"episodes.csv": "episode,env_steps,return,length,success,collision\n" + rows,
+              "progress.csv": f"epoch,env_steps,EpRet\n1,{steps // 2},\n2,{steps},\n"}
+    for name, text in tables.items():
+        path = folder / (name + ".gz" * compress)
+        path.write_bytes(gzip.compress(text.encode()) if compress else text.encode())
+    return folder
+
+
+def table(capsys, *runs, task="p2p"):
+    """(text, rows of the CSV) of the training table of these run folders; of the default ones if none is named."""
+    out = plot_curves.FIGURES.parent / "table.csv"
+    named = ["--runs", *map(str, runs)] if runs else []
+    plot_curves.main(["--table", "training", "--task", task, "--csv", str(out), *named])
+    return capsys.readouterr().out, list(csv.DictReader(io.StringIO(out.read_text())))
+
+
+def cell(rows, metric, sweep="lambda", num_demos="100", lambda_bc=1.8):
+    """The one CSV line of this metric and column."""
+    found = [row for row in rows if row["metric"] == metric and row["sweep"] == sweep
+             and row["num_demos"] == num_demos and float(row["lambda_bc"]) == lambda_bc]
+    assert len(found) == 1
+    return found[0]
+
+
+def error_line(capsys, *argv):
+    """What main says on bad input: exit code 2, nothing on standard output, one line on standard error."""
+    with pytest.raises(SystemExit) as stopped:
+        plot_curves.main(list(map(str, argv)))
+    out, err = capsys.readouterr()
+    assert stopped.value.code == 2 and out == "" and err.count("\n") == 1
+    return err
+
+
+# ------------------------------------------------------------------------------------------ metrics
+
+def test_R10_and_R90_are_means_over_a_tenth_of_the_episodes_rounded_up():
+    metrics = training_metrics(np.arange(11.0))  # a tenth of 11 is 2 episodes: (0 + 1) / 2 and (9 + 10) / 2
+    assert (metrics["R10"], metrics["R90"], metrics["I_R"]) == (0.5, 9.5, 9.0)
+    metrics = training_metrics(np.arange(10.0))  # a tenth of 10 is 1
+    assert (metrics["R10"], metrics["R90"], metrics["I_R"]) == (0.0, 9.0, 9.0)
+
+
+def test_T50_is_the_first_full_window_above_half_of_R90():
+    # R90 = 10; 25 tens among the last 50 (episode 125) make exactly 5, the 26th exceeds it
+    assert training_metrics(np.repeat([0.0, 10.0], 100))["T50"] == 126
+
+
+def test_T50_counts_no_window_of_fewer_than_50_episodes():
+    assert training_metrics(np.full(200, 10.0))["T50"] == 50
+    assert math.isnan(training_metrics(np.full(49, 10.0))["T50"])
+
+
+def test_T50_is_not_available_where_R90_is_not_positive_or_never_half_reached():
+    assert math.isnan(training_metrics(np.repeat([5.0, -1.0], 100))["T50"])
+    assert math.isnan(training_metrics(np.repeat([5.0, 0.0], 100))["T50"])
+    assert math.isnan(training_metrics(np.repeat([0.0, 10.0], [90, 10]))["T50"])  # the last window's mean is 2
+
+
+def test_interval_of_two_seeds_spans_them_and_of_equal_seeds_is_their_value():
+    assert interval(np.array([0.0, 1.0])) == (0.0, 1.0, "BCa")  # resampled means: 0, 1/2, 1 with 1/4, 1/2, 1/4
+    assert interval(np.array([7.0, 7.0, 7.0])) == (7.0, 7.0, "percentile")
+
+
+def test_interval_lies_within_the_seeds_around_their_mean_and_is_the_same_each_time():
+    values = np.array([1.0, 2.0, 3.0, 4.0, 10.0])
+    low, high, method = interval(values)
+    assert 1 < low < 3 and 5 < high < 10 and method == "BCa"
+    assert interval(values) == (low, high, method)
+
+
+def test_a_single_seed_has_no_interval_and_no_mark():
+    one = over_seeds(np.array([3.0]), paper=100.0, digits=2)
+    assert one["mean"] == 3 and one["interval"] == "" and math.isnan(one["low"]) and one["paper_outside"] == 0
+    assert plot_curves.cell_text(one, 2) == "  3.00 [-]"
+
+
+def test_NA_seeds_are_counted_and_not_averaged():
+    some = over_seeds(np.array([300.0, math.nan, 500.0]), paper=398, digits=0)
+    assert (some["mean"], some["low"], some["high"], some["na_seeds"]) == (400, 300, 500, 1)
+    assert plot_curves.cell_text(some, 0) == "   400 [300, 500] (1 N/A)"
+    none = over_seeds(np.array([math.nan, math.nan]), paper=398, digits=0)
+    assert plot_curves.cell_text(none, 0) == "   N/A [-] (2 N/A)"
+
+
+@pytest.mark.parametrize("paper, outside", [(0.99, 1), (1.0, 0), (2.0, 0), (3.0, 0), (3.01, 1), (math.nan, 0)])
+def test_a_cell_is_marked_where_the_papers_value_lies_outside_the_interval_as_printed(paper, outside):
+    marked = over_seeds(np.array([1.004, 2.996]), paper, digits=2)  # printed [1.00, 3.00]
+    assert marked["paper_outside"] == outside
+    assert plot_curves.cell_text(marked, 2).endswith(" *") == bool(outside)
+
+
+# ------------------------------------------------------------------------------------------ table
+
+def test_without_runs_the_table_is_the_papers_in_its_order(capsys):
+    text, rows = table(capsys)
+    lines = [line.split() for line in text.splitlines() if " paper " in line]
+    assert lines[0] == ["lambda_BC", "100", "0.1", "paper", "-0.44", "3.72", "4.16", "657"]
+    assert lines[6] == ["baseline", "0", "0", "paper", "-0.56", "0.90", "1.49", "486"]  # I_R as printed, not 1.46
+    assert len(lines) == text.count("no runs") == 7 and len(rows) == 7 * 4
+    assert "as CSV" in text.splitlines()[-1]
+    assert "N/A" in [line for line in table(capsys, task="p2po")[0].splitlines() if line.startswith("baseline")][0]
+
+
+def test_the_table_prints_the_mean_over_seeds_with_interval_beside_the_paper(tmp_path, capsys):
+    for seed, value in enumerate((1.0, 3.0)):
+        write_run(tmp_path / f"runs/{seed}", np.repeat([-0.12, value], 50), seed=seed)
+    text, rows = table(capsys)
+    ours = text.splitlines()[text.splitlines().index(next(s for s in text.splitlines() if " 8.94 " in s)) + 1]
+    assert ours.split("  ")[-1].strip() == "2" and "ddpg robust so2 4k steps" in ours  # two seeds
+    assert "2.00 [1.00, 3.00] *" in ours and "-0.12 [-0.12, -0.12]  " in ours
+    R90 = cell(rows, "R90")
+    assert [R90[k] for k in ("paper", "mean", "low", "high", "interval", "seeds", "paper_outside")] == [
+        "8.94", "2.0", "1.0", "3.0", "BCa", "2", "1"]
+    assert [R90[k] for k in ("algo", "recipe", "symmetry", "total_env_steps")] == ["ddpg", "robust", "so2", "4000"]
+    assert cell(rows, "R10")["paper_outside"] == "0" and cell(rows, "R90", lambda_bc=0.6)["mean"] == ""
+
+
+def test_no_demonstrations_with_lambda_1_and_the_baseline_are_different_columns(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", [2.0] * 60, num_demos=0, lambda_bc=1)
+    write_run(tmp_path / "runs/b", [3.0] * 60, num_demos=0, lambda_bc=0)
+    _, rows = table(capsys)
+    assert cell(rows, "R90", "demos", "0", 1.0)["mean"] == "2.0"
+    assert cell(rows, "R90", "baseline", "0", 0.0)["mean"] == "3.0"
+
+
+def test_the_pick_and_place_run_400_15_stands_in_both_sweeps(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", task="pnp", algo="ppo", num_demos=400, lambda_bc=15)
+    _, rows = table(capsys, task="pnp")
+    assert [cell(rows, "R90", sweep, "400", 15.0)["mean"] for sweep in ("lambda", "demos")] == ["1.0", "1.0"]
+
+
+@pytest.mark.parametrize("config", [{"lambda_bc": 7.5}, {"num_demos": 80}, {"algo": "ppo"}])
+def test_a_run_of_no_printed_column_is_listed_as_not_in_the_papers_table(tmp_path, capsys, config):
+    write_run(tmp_path / "runs/a", **config)
+    text, rows = table(capsys)
+    assert text.count("not in the paper's table") == 1 and text.count("no runs") == 7
+    assert [(row["mean"], row["paper"]) for row in rows if row["sweep"] == "other" and row["metric"] == "R90"] == [
+        ("1.0", "")]
+
+
+@pytest.mark.parametrize("config", [{"recipe": "paper"}, {"symmetry": "gas"}, {"epochs": 1}])
+def test_runs_that_differ_in_recipe_symmetry_or_length_are_never_averaged_together(tmp_path, capsys, config):
+    write_run(tmp_path / "runs/a", [1.0] * 60)
+    write_run(tmp_path / "runs/b", [3.0] * 60, **config)
+    _, rows = table(capsys)
+    assert sorted(row["mean"] for row in rows if row["metric"] == "R90" and row["mean"]) == ["1.0", "3.0"]
+
+
+# ------------------------------------------------------------------------------------------ which runs
+
+def test_quick_runs_are_left_out_unless_they_are_named(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", quick=True)
+    text, rows = table(capsys)
+    assert "left out: 1 --quick run" in text and cell(rows, "R90")["seeds"] == "0"
+    text, rows = table(capsys, tmp_path / "runs/a")
+    assert "left out" not in text and cell(rows, "R90")["seeds"] == "1"
+
+
+def test_runs_are_found_at_any_depth_and_a_folder_named_twice_counts_once(tmp_path, capsys):
+    write_run(tmp_path / "elsewhere/deep/er/a", seed=0)
+    write_run(tmp_path / "elsewhere/b", seed=1)
+    _, rows = table(capsys, tmp_path / "elsewhere", tmp_path / "elsewhere/deep/../b")
+    assert cell(rows, "R90")["seeds"] == "2"
+
+
+def test_gzipped_tables_read_like_plain_ones(tmp_path, capsys):
+    curve = np.sin(np.arange(100.0)) + 2
+    plain = table(capsys, write_run(tmp_path / "plain", curve))
+    assert table(capsys, write_run(tmp_path / "gzipped", curve, compress=True)) == plain
+
+
+def test_an_unfinished_run_is_used_and_flagged_with_its_steps(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", seed=0)
+    write_run(tmp_path / "runs/b", seed=1, steps=2600)
+    text, rows = table(capsys)
+    assert "2 (1 unfinished)" in text and "runs/b, 2,600 of 4,000 environment steps" in text
+    assert "runs/a" not in text and cell(rows, "R90")["unfinished_seeds"] == "1"
+
+
+def test_a_run_without_an_episode_yet_is_left_out_and_said_so(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", returns=(), steps=0)
+    text, rows = table(capsys)
+    assert "runs/a has no episode yet" in text and cell(rows, "R90")["seeds"] == "0"
+
+
+def test_a_published_copy_of_a_run_is_no_second_seed(tmp_path, capsys):
+    write_run(tmp_path / "runs/a")
+    write_run(tmp_path / "results/a", compress=True)
+    _, rows = table(capsys)
+    assert cell(rows, "R90")["seeds"] == "1"
+
+
+@pytest.mark.parametrize("one, other, returns", [("runs/a", "runs/b", 1.0), ("results/a", "runs/b", 1.0),
+                                                 ("results/a", "runs/a", 2.0), ("x/a", "y/a", 1.0)])
+def test_two_runs_of_one_configuration_and_seed_clash(tmp_path, capsys, one, other, returns):
+    write_run(tmp_path / one)
+    write_run(tmp_path / other, [returns] * 60)
+    err = error_line(capsys, "--table", "training", "--task", "p2p", "--runs", tmp_path)
+    assert str(tmp_path / one) in err and str(tmp_path / other) in err
+
+
+# ------------------------------------------------------------------------------------------ figure
+
+def test_the_figure_draws_each_sweep_with_the_baseline_and_the_papers_R90(tmp_path):
+    for i, (N, lam) in enumerate([(100, 0.1), (80, 1), (0, 0), (300, 7)]):
+        write_run(tmp_path / f"runs/{i}", [i + 1.0] * 60, num_demos=N, lambda_bc=lam)
+    runs, _ = plot_curves.find_runs("p2p", None)
+    axes = plot_curves.learning_figure("p2p", runs).axes
+    panels = [{line.get_label(): line.get_ydata()[-1] for line in ax.lines if "seed" in line.get_label()}
+              for ax in axes]
+    both = {"DDPG (1 seed)": 3, r"$N_{demos}=300$, $\lambda_{BC}=7$ (1 seed)": 4}
+    assert panels == [{r"$\lambda_{BC}=0.1$ (1 seed)": 1} | both, {r"$N_{demos}=80$ (1 seed)": 2} | both]
+    dotted = [[line.get_ydata()[0] for line in ax.lines if line.get_linestyle() == ":"] for ax in axes]
+    assert dotted == [[3.72, 0.9], [8.58, 0.9]]
+
+
+def test_a_curve_is_the_mean_over_all_seeds_up_to_the_shortest_with_a_band(tmp_path):
+    write_run(tmp_path / "runs/a", [1.0] * 100, seed=0)
+    write_run(tmp_path / "runs/b", [3.0] * 150, seed=1)
+    runs, _ = plot_curves.find_runs("p2p", None)
+    ax, empty = plot_curves.learning_figure("p2p", runs).axes
+    assert [text.get_text() for text in (*ax.texts, *empty.texts)] == ["", "no runs"]
+    thick, thin = ax.lines[:2]
+    assert thick.get_label() == r"$\lambda_{BC}=1.8$ (2 seeds)"
+    assert (thick.get_xdata()[-1], set(thick.get_ydata())) == (100, {2.0})
+    assert (thin.get_xdata()[-1], thin.get_ydata()[-1]) == (150, 3.0)
+    band = ax.collections[0].get_paths()[0].vertices
+    assert band[:, 0].max() == 100 and (band[:, 1].min(), band[:, 1].max()) == (1.0, 3.0)
+
+
+def test_both_panels_reach_to_the_longest_curve_of_either(tmp_path):
+    write_run(tmp_path / "runs/a", [1.0] * 60)
+    write_run(tmp_path / "runs/b", [9.0] * 300, num_demos=80, lambda_bc=1)
+    for ax in plot_curves.learning_figure("p2p", plot_curves.find_runs("p2p", None)[0]).axes:
+        assert ax.get_xlim()[0] == 0 and ax.get_xlim()[1] >= 300 and ax.get_ylim()[0] <= 1 and ax.get_ylim()[1] >= 9
+
+
+def test_the_running_mean_is_over_the_last_50_returns():
+    smooth = plot_curves.running_mean(np.repeat([0.0, 10.0], 50))
+    assert len(smooth) == 100 and (smooth[49], smooth[50], smooth[74], smooth[99]) == (0, 0.2, 5, 10)
+    assert plot_curves.running_mean(np.array([1.0, 3.0])).tolist() == [1, 2]
+
+
+@pytest.mark.filterwarnings("error")  # a warning would reach the terminal
+def test_the_figure_is_written_as_png_and_pdf_or_to_the_named_file(tmp_path, capsys):
+    write_run(tmp_path / "runs/a")
+    plot_curves.main(["--figure", "learning", "--task", "p2p"])
+    plot_curves.main(["--figure", "learning", "--task", "p2p", "--out", str(tmp_path / "new/x.pdf")])
+    assert sorted(p.name for p in (tmp_path / "figures").iterdir()) == ["fig-learning-p2p.pdf", "fig-learning-p2p.png"]
+    assert (tmp_path / "figures/fig-learning-p2p.png").read_bytes().startswith(b"\x89PNG")
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["x.pdf"]
+    assert (tmp_path / "new/x.pdf").read_bytes().startswith(b"%PDF")
+
+
+# ------------------------------------------------------------------------------------------ bad input
+
+TABLE = ("--table", "training", "--task", "p2p")
+
+
+@pytest.mark.parametrize("argv, names", [
+    ((), "--task"), (("--task", "p2p"), "--table --figure"), (("--table", "training"), "--task"),
+    (("--table", "training", "--task", "walk"), "'p2p', 'p2po', 'pnp'"),
+    (("--table", "test", "--task", "p2p"), "--table"),
+    ((*TABLE, "--figure", "learning"), "--figure"), ((*TABLE, "--out", "x.png"), "--out"),
+    ((*TABLE, "--sed", "1"), "--sed"), (("--tab", "training", "--task", "p2p"), "--table"),
+    (("--figure", "learning", "--task", "p2p", "--csv", "x.csv"), "--csv"),
+    (("--figure", "learning", "--task", "p2p", "--out", "x.gif"), ".png or .pdf"),
+    (("--figure", "learning", "--task", "p2p"), "no run of task p2p"),
+    ((*TABLE, "--runs", "/nowhere"), "--runs /nowhere: no run there"), ((*TABLE, "--runs"), "--runs"),
+])
+def test_a_bad_flag_is_one_line_that_names_it(capsys, argv, names):
+    assert names in error_line(capsys, *argv)
+
+
+def test_runs_named_of_another_task_only_are_an_error_but_among_others_are_passed_over(tmp_path, capsys):
+    write_run(tmp_path / "x/a", task="pnp")
+    assert "--runs: no run of task p2p" in error_line(capsys, *TABLE, "--runs", tmp_path / "x")
+    write_run(tmp_path / "x/b")
+    assert cell(table(capsys, tmp_path / "x")[1], "R90")["seeds"] == "1"
+
+
+@pytest.mark.parametrize("file, content, says", [
+    ("config.json", "{", "JSON"), ("config.json", "5", "no key 'task'"), ("config.json", "\udcff", "config.json"),
+    ("config.json", json.dumps({k: v for k, v in CONFIG.items() if k != "recipe"}), "no key 'recipe'"),
+    ("config.json", json.dumps(CONFIG | {"lambda_bc": "a lot"}), "'lambda_bc' is 'a lot'"),
+    ("config.json", json.dumps(CONFIG | {"lambda_bc": math.nan}), "'lambda_bc' is nan"),
+    ("config.json", json.dumps(CONFIG | {"seed": 1.5}), "an integer"),
+    ("config.json", json.dumps(CONFIG | {"epochs": True}), "an integer"),
+    ("config.json", json.dumps(CONFIG | {"quick": 0}), "true or false"),
+    ("episodes.csv", None, "no such file"), ("episodes.csv", "", "no column episode, return"),
+    ("episodes.csv", "episode,length\n1,2\n", "no column return"), ("episodes.csv", "\udcff\udcfe", "episodes.csv"),
+    ("episodes.csv", "episode,return\n1,0.5\n2", "line 3 is cut short"),
+    ("episodes.csv", "episode,return\n1,0.5\n2,oops\n", "'oops'"),
+    ("episodes.csv", "episode,return\n1,0.5\n2,nan\n", "nan or inf in column return"),
+    ("episodes.csv", "episode,return\n1,0.5\n3,0.5\n", "column episode is garbled"),
+    ("episodes.csv.gz", "not gzip", "episodes.csv.gz"), ("episodes.csv.gz", gzip.compress(b"1,2\n" * 99)[:20], "ended"),
+    ("progress.csv", None, "no such file"), ("progress.csv", "epoch\n1\n", "no column env_steps"),
+])
+def test_a_bad_file_is_one_line_that_names_it(tmp_path, capsys, file, content, says):
+    run = write_run(tmp_path / "runs/a")
+    (run / file.removesuffix(".gz")).unlink()
+    if content is not None:
+        (run / file).write_bytes(content if isinstance(content, bytes) else content.encode(errors="surrogateescape"))
+    err = error_line(capsys, *TABLE, "--csv", tmp_path / "t.csv")
+    assert f"{run / file}: " in err and says in err and not (tmp_path / "t.csv").exists()
+
+
+@pytest.mark.parametrize("what, flag, file", [
+    ("--table=training", "--csv", "taken.csv"), ("--table=training", "--csv", "."),
+    ("--figure=learning", "--out", "taken.png")])
+def test_a_file_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path, capsys, what, flag, file):
+    write_run(tmp_path / "runs/a")
+    (tmp_path / "x" / file).mkdir(parents=True)
+    assert f"{flag} {tmp_path / 'x' / file}: " in error_line(capsys, what, "--task", "p2p", flag, tmp_path / "x" / file)
+    assert [p for p in tmp_path.rglob("*") if p.is_file() and "runs" not in p.parts] == []
+
+
+def test_a_write_that_breaks_off_leaves_the_old_file_whole(tmp_path, capsys):
+    def break_off(path):
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "t.csv").write_text("old")
+    with pytest.raises(SystemExit):
+        plot_curves.write("--csv", tmp_path / "t.csv", break_off)
+    assert "No space left" in capsys.readouterr().err
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("t.csv", "old")]
+    paths = []
+    plot_curves.write("--csv", tmp_path / "t.csv", lambda path: (paths.append(path), path.write_text("new")))
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("t.csv", "new")]
+    assert tmp_path / "t.csv" not in paths  # it comes into being whole, by a rename
+
+
+def test_as_a_command_bad_input_is_exit_code_2_one_line_and_no_traceback(tmp_path):
+    write_run(tmp_path / "a")
+    (tmp_path / "a/episodes.csv").write_bytes(b"\x00\xff")
+    script = Path(plot_curves.__file__)
+    done = subprocess.run([sys.executable, script, *TABLE, "--runs", tmp_path], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "Traceback" not in done.stderr and "a/episodes.csv" in done.stderr
