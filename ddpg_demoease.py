@@ -168,19 +168,82 @@ def mlp(sizes, layernorm=False):
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 
-class ActorCritic(nn.Module):
-    """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R."""
+class _Forward(torch.autograd.Function):
+    """An mlp() as one node of the graph: for nets this small, a node a layer costs as much as the matrix products.
 
-    def __init__(self, obs_dim, hidden_sizes, critic_layernorm):
+    With `flat` the gradients of the weights are written into their place in flatten()'s vector; with None they are not
+    computed, only that of x (for Q's gradient with respect to the action).
+    """
+
+    @staticmethod
+    def forward(ctx, x, flat, layers):
+        saved = []
+        for kind, *w in layers:
+            saved.append(x)
+            if kind is nn.Linear:
+                x = torch.addmm(w[1], x, w[0].t())
+            elif kind is nn.LayerNorm:
+                x, *statistics = torch.native_layer_norm(x, w[1].shape, w[0], w[1], 1e-5)
+                saved[-1] = (saved[-1], *statistics)
+            else:
+                x = x.relu_()
+                saved[-1] = x
+        ctx.saved, ctx.layers, ctx.train = saved, layers, flat is not None
+        return x
+
+    @staticmethod
+    def backward(ctx, g):
+        for i in reversed(range(len(ctx.layers))):
+            (kind, *w), x, train = ctx.layers[i], ctx.saved[i], ctx.train
+            if kind is nn.Linear:
+                if train:
+                    torch.mm(g.t(), x, out=w[2])
+                    torch.sum(g, 0, out=w[3])
+                g = torch.mm(g, w[0]) if i or ctx.needs_input_grad[0] else None
+            elif kind is nn.LayerNorm:
+                need = (True, train, train)
+                g, *dw = torch.ops.aten.native_layer_norm_backward(g, x[0], w[1].shape, *x[1:], w[0], w[1], need)
+                if train:
+                    w[2].copy_(dw[0])
+                    w[3].copy_(dw[1])
+            else:
+                g = torch.ops.aten.threshold_backward(g, x, 0)
+        return g, None, None
+
+
+class ActorCritic(nn.Module):
+    """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R. All weights, and all gradients, lie in one vector
+    each (`flat`, `grad`; `mu` and `nu` are its two parts), so that optimiser and target update are one operation."""
+
+    def __init__(self, obs_dim, hidden_sizes, critic_layernorm, device):
         super().__init__()
         self.u = mlp([obs_dim, *hidden_sizes, 4])  # pre-tanh
         self.q = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
+        self.flat = torch.cat([p.detach().flatten() for p in self.parameters()]).to(device)
+        self.grad = torch.zeros_like(self.flat)
+        i, self.layers = 0, {}
+        for net in (self.u, self.q):
+            self.layers[net] = []
+            for layer in net:
+                self.layers[net].append([type(layer)])
+                for p in layer.parameters():
+                    part = slice(i, i := i + p.numel())
+                    p.data, p.grad = self.flat[part].view_as(p), self.grad[part].view_as(p)
+            for p_layer, layer in zip(self.layers[net], net, strict=True):
+                p_layer += [p.data for p in layer.parameters()] + [p.grad for p in layer.parameters()]
+        n = sum(p.numel() for p in self.u.parameters())
+        self.mu, self.nu = nn.Parameter(self.flat[:n]), nn.Parameter(self.flat[n:])
+        self.mu.grad, self.nu.grad = self.grad[:n], self.grad[n:]
+
+    def pre_tanh(self, s):
+        return _Forward.apply(s, self.mu, self.layers[self.u])
 
     def pi(self, s):
-        return torch.tanh(self.u(s))
+        return torch.tanh(self.pre_tanh(s))
 
-    def Q(self, s, a):
-        return self.q(torch.cat((s, a), dim=-1)).squeeze(-1)
+    def Q(self, s, a, train=True):
+        """train: whether a backward pass reaches the critic's weights, or only the action."""
+        return _Forward.apply(torch.cat((s, a), dim=-1), self.nu if train else None, self.layers[self.q]).squeeze(-1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -215,30 +278,17 @@ def loss_A(L_O, L_BC, lambda_bc):
 # ---- update ----------------------------------------------------------------------------------------------------------
 
 
-def flatten(module):
-    """Puts the module's weights, and their gradients, into one vector each: the optimiser and the target update then
-    cost one operation instead of one a layer. Returns the vector, a Parameter."""
-    flat = nn.Parameter(torch.cat([p.detach().flatten() for p in module.parameters()]))
-    flat.grad = torch.zeros_like(flat)
-    i = 0
-    for p in module.parameters():
-        p.data, p.grad = flat.data[i : i + p.numel()].view_as(p), flat.grad[i : i + p.numel()].view_as(p)
-        i += p.numel()
-    return flat
-
-
 class Learner:
     """Networks, targets, optimisers, and the gradient step of ag:d-ease-off."""
 
     def __init__(self, flags, obs_dim):
         self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1)
         cuda = flags.device == "cuda"
-        self.net = ActorCritic(obs_dim, flags.hidden_sizes, flags.critic_layernorm).to(flags.device)
-        self.target = deepcopy(self.net)
-        self.mu, self.nu = flatten(self.net.u), flatten(self.net.q)
-        self.mu_target, self.nu_target = flatten(self.target.u), flatten(self.target.q)
-        self.pi_opt = torch.optim.Adam([self.mu], lr=flags.pi_lr, fused=True, capturable=cuda)
-        self.q_opt = torch.optim.Adam([self.nu], lr=flags.q_lr, fused=True, capturable=cuda)
+        sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.device)
+        self.net, self.target = ActorCritic(*sizes), ActorCritic(*sizes)
+        self.target.flat.copy_(self.net.flat)
+        groups = [dict(params=[self.net.mu], lr=flags.pi_lr), dict(params=[self.net.nu], lr=flags.q_lr)]
+        self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
         self.actor = deepcopy(self.net.u).cpu() if cuda else self.net.u  # what acts, on the CPU
         self.return_range = (-4.0, TASKS[flags.task].return_max)
         self.graph, self.eager_updates = None, 0
@@ -275,9 +325,9 @@ class Learner:
         Q_s_a = self.net.Q(s, a)
         L_C = loss_C(Q_s_a, y)
 
-        u = self.net.u(torch.cat((s, s_demo)))
+        u = self.net.pre_tanh(torch.cat((s, s_demo)))
         a_pi, a_hat = torch.tanh(u).split((n, n_demo))
-        L_O = L_A = loss_O(self.net.Q(s, a_pi), f.normalize_q)
+        L_O = L_A = loss_O(self.net.Q(s, a_pi, train=False), f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
             with torch.no_grad():
@@ -286,15 +336,11 @@ class Learner:
             L_BC = loss_BC(a_demo, a_hat, M)
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
-        self.mu.grad.zero_()
-        self.nu.grad.zero_()
-        L_C.backward(inputs=list(self.net.q.parameters()))
-        L_A.backward(inputs=list(self.net.u.parameters()))
-        self.q_opt.step()
-        self.pi_opt.step()
+        L_C.backward()
+        L_A.backward()
+        self.optimizer.step()
         with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
-            self.mu_target.lerp_(self.mu, 1 - f.polyak)
-            self.nu_target.lerp_(self.nu, 1 - f.polyak)
+            self.target.flat.lerp_(self.net.flat, 1 - f.polyak)
             return {
                 "L_O": L_O.detach(),
                 "L_BC": L_BC.detach(),
@@ -334,15 +380,15 @@ class Learner:
 
     def state(self):
         return {
-            "net": self.net.state_dict(),
-            "target": self.target.state_dict(),
-            "pi_opt": self.pi_opt.state_dict(),
-            "q_opt": self.q_opt.state_dict(),
+            "net": self.net.flat.cpu().clone(),
+            "target": self.target.flat.cpu().clone(),
+            "optimizer": self.optimizer.state_dict(),
         }
 
     def load(self, state):
-        for name, part in state.items():
-            getattr(self, name).load_state_dict(part)
+        self.net.flat.copy_(state["net"])
+        self.target.flat.copy_(state["target"])
+        self.optimizer.load_state_dict(state["optimizer"])
         self.actor.load_state_dict(self.net.u.state_dict())
 
     def policy(self):
