@@ -171,44 +171,50 @@ def mlp(sizes, layernorm=False):
 class _Forward(torch.autograd.Function):
     """An mlp() as one node of the graph: for nets this small, a node a layer costs as much as the matrix products.
 
-    With `flat` the gradients of the weights are written into their place in flatten()'s vector; with None they are not
-    computed, only that of x (for Q's gradient with respect to the action).
+    Of the rows of x, the first `train` give gradients to the weights (written into their place in ActorCritic.grad),
+    the first `alive` may carry a gradient at all, and those from `train` on pass theirs on to x.
     """
 
     @staticmethod
-    def forward(ctx, x, flat, layers):
+    def forward(ctx, x, weights, layers, train, alive):
         saved = []
         for kind, *w in layers:
-            saved.append(x)
+            saved.append((x[:alive],))
             if kind is nn.Linear:
                 x = torch.addmm(w[1], x, w[0].t())
             elif kind is nn.LayerNorm:
-                x, *statistics = torch.native_layer_norm(x, w[1].shape, w[0], w[1], 1e-5)
-                saved[-1] = (saved[-1], *statistics)
+                x, mean, rstd = torch.native_layer_norm(x, w[1].shape, w[0], w[1], 1e-5)
+                saved[-1] += (mean[:alive], rstd[:alive])
             else:
                 x = x.relu_()
-                saved[-1] = x
-        ctx.saved, ctx.layers, ctx.train = saved, layers, flat is not None
+        ctx.saved, ctx.layers, ctx.train, ctx.alive, ctx.rows = saved, layers, train, alive, len(x)
         return x
 
     @staticmethod
     def backward(ctx, g):
+        n, g = ctx.train, g[: ctx.alive]
         for i in reversed(range(len(ctx.layers))):
-            (kind, *w), x, train = ctx.layers[i], ctx.saved[i], ctx.train
+            (kind, *w), (x, *statistics) = ctx.layers[i], ctx.saved[i]
             if kind is nn.Linear:
-                if train:
-                    torch.mm(g.t(), x, out=w[2])
-                    torch.sum(g, 0, out=w[3])
-                g = torch.mm(g, w[0]) if i or ctx.needs_input_grad[0] else None
+                torch.mm(g[:n].t(), x[:n], out=w[2])
+                torch.sum(g[:n], 0, out=w[3])
+                if i:
+                    g = torch.mm(g, w[0])
             elif kind is nn.LayerNorm:
-                need = (True, train, train)
-                g, *dw = torch.ops.aten.native_layer_norm_backward(g, x[0], w[1].shape, *x[1:], w[0], w[1], need)
-                if train:
-                    w[2].copy_(dw[0])
-                    w[3].copy_(dw[1])
+                dw = torch.ops.aten.native_layer_norm_backward(
+                    g, x, w[1].shape, *statistics, w[0], w[1], (True, False, False)
+                )[0]
+                normal = (x[:n] - statistics[0][:n]).mul_(statistics[1][:n])
+                torch.sum(normal.mul_(g[:n]), 0, out=w[2])
+                torch.sum(g[:n], 0, out=w[3])
+                g = dw
             else:
-                g = torch.ops.aten.threshold_backward(g, x, 0)
-        return g, None, None
+                g = torch.ops.aten.threshold_backward(g, x, 0)  # x is what relu_ left there
+        if not ctx.needs_input_grad[0]:
+            return None, None, None, None, None
+        g_x = g.new_zeros(ctx.rows, ctx.saved[0][0].shape[1])
+        torch.mm(g[n:], ctx.layers[0][1], out=g_x[n : ctx.alive])
+        return g_x, None, None, None, None
 
 
 class ActorCritic(nn.Module):
@@ -236,14 +242,15 @@ class ActorCritic(nn.Module):
         self.mu.grad, self.nu.grad = self.grad[:n], self.grad[n:]
 
     def pre_tanh(self, s):
-        return _Forward.apply(s, self.mu, self.layers[self.u])
+        return _Forward.apply(s, self.mu, self.layers[self.u], len(s), len(s))
 
     def pi(self, s):
         return torch.tanh(self.pre_tanh(s))
 
-    def Q(self, s, a, train=True):
-        """train: whether a backward pass reaches the critic's weights, or only the action."""
-        return _Forward.apply(torch.cat((s, a), dim=-1), self.nu if train else None, self.layers[self.q]).squeeze(-1)
+    def Q(self, s, a, train=0, alive=0):
+        """Q_nu of (n, obs_dim) and (n, 4). In a backward pass the first `train` rows reach the critic's weights, rows
+        train to alive reach the actions, and the rest nothing."""
+        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, self.layers[self.q], train, alive).squeeze(1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -322,22 +329,20 @@ class Learner:
             y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
             if f.clip_target:
                 y = y.clamp(*self.return_range)
-        Q_s_a = self.net.Q(s, a)
-        L_C = loss_C(Q_s_a, y)
-
         u = self.net.pre_tanh(torch.cat((s, s_demo)))
         a_pi, a_hat = torch.tanh(u).split((n, n_demo))
-        L_O = L_A = loss_O(self.net.Q(s, a_pi, train=False), f.normalize_q)
+        # One pass of the critic for L_C (which reaches its weights), L_O (which reaches the actor) and the mask.
+        Q = self.net.Q(torch.cat((s, s, s_demo, s_demo)), torch.cat((a, a_pi, a_hat.detach(), a_demo)), n, 2 * n)
+        Q_s_a, Q_s_pi, Q_own, Q_demo = Q.split((n, n, n_demo, n_demo))
+        L_C = loss_C(Q_s_a, y)
+        L_O = L_A = loss_O(Q_s_pi, f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
-            with torch.no_grad():
-                Q_own, Q_demo = self.net.Q(torch.cat((s_demo, s_demo)), torch.cat((a_hat, a_demo))).chunk(2)
             M = mask(Q_demo, Q_own)
             L_BC = loss_BC(a_demo, a_hat, M)
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
-        L_C.backward()
-        L_A.backward()
+        (L_C + L_A).backward()
         self.optimizer.step()
         with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
             self.target.flat.lerp_(self.net.flat, 1 - f.polyak)

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-
 import pybullet
 
 URDF = Path(__file__).parent / "data" / "robot" / "gen3_2f85.urdf"
