@@ -44,8 +44,8 @@ class Flags:
                               ("paper", "robust"))  # fmt: skip
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; 100 on p2p, 250 on p2po, 400 on pnp", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (eq:loss_actor); 1.8 on p2p, 2 on p2po, 15 on pnp", low=0)
-    symmetry: str | None = flag(None, "none; gas: demonstrations of one partition mapped to K; so2: every sample turned "
-                                "by a random angle; canonical: the networks see the arm's own frame. paper: gas",
+    symmetry: str | None = flag(None, "none; gas: demonstrations of one partition mapped to K (paper); so2: samples "
+                                "turned by random angles; canonical: the networks see the arm's own frame",
                                 ("none", "gas", "so2", "canonical"))  # fmt: skip
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
@@ -107,7 +107,8 @@ def complete(flags):
             if getattr(flags, key) is None:
                 setattr(flags, key, value)
     T = flags.max_ep_len
-    for key, value in dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T).items():
+    schedule = dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
+    for key, value in schedule.items():
         if getattr(flags, key) is None:
             setattr(flags, key, value)
     flags.hidden_sizes = tuple(flags.hidden_sizes)
@@ -301,7 +302,7 @@ class Learner:
         self.graph, self.eager_updates = None, 0
 
     def block(self, B_o, B_d):
-        """`update_every` updates (B_d None: no behaviour cloning). Returns the last one's measurements, floats by name."""
+        """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name."""
         f = self.flags
         n = f.update_every
         rows, rows_demo = B_o.sample(f.batch_size, n), B_d.sample(f.demo_batch_size, n) if B_d else None
@@ -319,7 +320,7 @@ class Learner:
         return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
 
     def update(self, rows, rows_demo):
-        """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). Returns 0-d tensors by name."""
+        """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). Returns 0-d tensors."""
         f = self.flags
         s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
         s_demo, a_demo = (s[:0], a[:0]) if rows_demo is None else rows_demo.split(self.widths, dim=-1)[:2]
@@ -424,8 +425,9 @@ def demonstrations(flags):
         logx.fail(f"--demos {error}")
     if flags.symmetry == "gas" and meta["symmetry"] != "gas":
         demos = gas.aggregate(demos, flags.partitions)
-    if len(demos["length"]) < flags.num_demos:
-        logx.fail(f"--demos {flags.demos}: gives {len(demos['length'])} episodes, fewer than --num_demos {flags.num_demos}")
+    found = len(demos["length"])
+    if found < flags.num_demos:
+        logx.fail(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     first = demos["episode"] < flags.num_demos
     return {name: rows[first] for name, rows in demos.items() if len(rows) == len(first)}, meta["env_steps"]
 
@@ -469,9 +471,10 @@ def train(flags):
     else:
         demos, demo_env_steps = demonstrations(flags)
         if demos:
-            if len(demos["rew"]) > flags.replay_size:
-                logx.fail(f"--replay_size {flags.replay_size}: holds less than the {len(demos['rew'])} demonstrated steps")
-            B_d = ReplayBuffer(obs_dim, len(demos["rew"]))
+            rows = len(demos["rew"])
+            if rows > flags.replay_size:
+                logx.fail(f"--replay_size {flags.replay_size}: holds less than the {rows} demonstrated steps")
+            B_d = ReplayBuffer(obs_dim, rows)
             columns = ("obs", "act", "rew", "obs2", "terminated")
             for s, a, r, s2, terminated in zip(*(demos[name] for name in columns), strict=True):
                 transition = (view(s), a, r, view(s2), terminated)

@@ -29,7 +29,8 @@ import logx
 import pid_demo
 from kinova_env import OBSERVATION, TASKS
 
-COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm", "goal_theta", "goal_rho", "goal_z"]
+COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm"]
+COLUMNS += ["goal_theta", "goal_rho", "goal_z"]
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
 
 

@@ -8,8 +8,8 @@
     aggregate(demos, K)   one partition's demonstrations, turned into all K       (sec:demo)
 
 The maps take numpy arrays or torch tensors of any leading shape and return the same type, dtype and device.
-Differs from the printed eq:st_p2p_phi: P_g (and P_o) rotate too, else R(s, a) = R(phi(s), psi(a)) does not hold; and q_1
-goes down where the world turns up, because joint 1 points down.
+Differs from the printed eq:st_p2p_phi: P_g (and P_o) rotate too, else R(s, a) = R(phi(s), psi(a)) does not hold; and
+q_1 goes down where the world turns up, because joint 1 points down.
 """
 
 import math
@@ -75,7 +75,7 @@ def phi(obs, k, K=4):
 
 
 def psi(action, k, K=4):
-    """Action map (`sec:envs`): the identity. action: (..., 4) joint velocities, which no rotation of the world changes."""
+    """Action map (`sec:envs`): the identity. action: (..., 4) joint velocities, the same in a turned world."""
     return action
 
 
@@ -107,9 +107,9 @@ def partition_of(obs, K=4):
 def aggregate(demos, K=4, num_demos=None):
     """Demonstrations of partition 0, mapped to all K (`sec:demo`): each episode, then its K - 1 images.
 
-    demos: the arrays that `pid_demo.record` returns (rows: obs, act, rew, obs2, terminated, truncated, episode; one
-    entry an episode: partition, success, length, return); other partitions' episodes are left out. Returns the same
-    arrays with K times the episodes, of which the first `num_demos` are kept. Rewards and ends are copied: they do not change under phi.
+    demos: the arrays of `pid_demo.record` (rows: obs, act, rew, obs2, terminated, truncated, episode; one entry an
+    episode: partition, success, length, return); other partitions' episodes are left out. Returns the same arrays
+    with K times the episodes, of which the first `num_demos` are kept. Rewards and ends do not change under phi.
     """
     rows = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")
     images = {name: [] for name in demos}

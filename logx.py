@@ -27,7 +27,9 @@ from pathlib import Path
 import torch
 
 EPISODES = ["episode", "env_steps", "return", "length", "success", "collision"]
-PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success", "L_O", "L_BC", "L_C", "L_A", "mask_fraction", "Q_mean", "Q_max", "pretanh_own", "pretanh_demo", "bc_relative_error", "eval_success", "eval_return"]
+PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success", "L_O", "L_BC", "L_C", "L_A"]
+PROGRESS += ["mask_fraction", "Q_mean", "Q_max", "pretanh_own", "pretanh_demo", "bc_relative_error"]
+PROGRESS += ["eval_success", "eval_return"]
 
 
 def fail(message):

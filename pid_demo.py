@@ -196,10 +196,11 @@ def main():
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
     demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
     won = demos["success"]
+    length = f"{demos['length'][won].mean():.0f} steps" if won.any() else "no success"
     print(
         f"{flags.task} {flags.stage}, K_P K_D K_I = {gains}: {len(won)} episodes, {steps} environment steps\n"
-        f"success {100 * won.mean():.1f} %, length of the successful {demos['length'][won].mean() if won.any() else np.nan:.0f} "
-        f"steps, return {demos['return'].mean():.2f}, mean |a| {np.abs(demos['act']).mean():.3f}"
+        f"success {100 * won.mean():.1f} %, length of the successful {length}, return {demos['return'].mean():.2f}, "
+        f"effort {demos['effort'].mean():.1f} %, mean |a| {np.abs(demos['act']).mean():.3f}"
     )
     if flags.record:
         meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))
