@@ -17,7 +17,7 @@ import math
 import signal
 import sys
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import gymnasium
@@ -96,32 +96,36 @@ BY_RECIPE = {
     "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
 }
 QUICK = dict(recipe="robust", epochs=15)
+# What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
+NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
+NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
+
+
+def fill_in(flags):
+    """The flags with what the task and the recipe decide in place of None."""
+    recipe = flags.recipe or ("robust" if flags.quick else "paper")
+    T = flags.max_ep_len or BY_TASK[flags.task]["max_ep_len"]
+    schedule = dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
+    defaults = BY_TASK[flags.task] | BY_RECIPE[recipe] | schedule | (QUICK if flags.quick else {}) | {"recipe": recipe}
+    return replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
 
 
 def complete(flags):
-    """Fills in what the task and the recipe decide; exits with 2 where a flag is out of range."""
-    defaults = [QUICK] if flags.quick else []
-    recipe = flags.recipe or ("robust" if flags.quick else "paper")
-    for values in (*defaults, dict(recipe=recipe), BY_RECIPE[recipe], BY_TASK[flags.task]):
-        for key, value in values.items():
-            if getattr(flags, key) is None:
-                setattr(flags, key, value)
-    T = flags.max_ep_len
-    schedule = dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
-    for key, value in schedule.items():
-        if getattr(flags, key) is None:
-            setattr(flags, key, value)
+    """(flags filled in, variant: what differs from the recipe); exits with 2 where a flag is out of range."""
+    flags = fill_in(flags)
     flags.hidden_sizes = tuple(flags.hidden_sizes)
     logx.check_ranges(flags)
+    printed = fill_in(Flags(task=flags.task, recipe=flags.recipe))
+    changed = {k: v for k, v in asdict(flags).items() if k not in NOT_A_VARIANT and v != getattr(printed, k)}
+    variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
     if flags.name is None:
-        flags.name = (
-            f"{flags.task}-ddpg-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}-seed{flags.seed}"
-        ) + ("-quick" if flags.quick else "")
+        flags.name = f"{flags.task}-ddpg-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
+        flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
     if "/" in flags.name or flags.name in ("", ".", ".."):
         logx.fail(f"--name {flags.name!r}: must be the name of one folder")
     if flags.device == "cuda" and not torch.cuda.is_available():
         logx.fail("--device cuda: torch sees no GPU here; use --device cpu")
-    return flags
+    return flags, variant
 
 
 # ---- replay buffers (B_o, B_d) ---------------------------------------------------------------------------------------
@@ -432,9 +436,9 @@ def demonstrations(flags):
     return {name: rows[first] for name, rows in demos.items() if len(rows) == len(first)}, meta["env_steps"]
 
 
-def train(flags):
+def train(flags, variant=""):
     """Runs ag:d-ease-off to the end, or on from the checkpoint. Returns the run's folder."""
-    config = asdict(flags) | {"algo": "ddpg"}
+    config = asdict(flags) | {"algo": "ddpg", "variant": variant}
     run = logx.Run(Path(flags.data_dir) / flags.name, config, flags.resume, flags.tensorboard)
     torch.manual_seed(flags.seed)
     rng = np.random.default_rng(flags.seed)  # exploration
@@ -592,8 +596,8 @@ TABLE = "{:>5} {:>9} {:>7} {:>7} {:>6} {:>9} {:>13} {:>7} {:>6} {:>11} {:>17} {:
 def main():
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    flags = complete(logx.parse_flags(Flags, __doc__))
-    folder = train(flags)
+    flags, variant = complete(logx.parse_flags(Flags, __doc__))
+    folder = train(flags, variant)
     if flags.quick:
         results = {str(folder): evaluate.run_trials(flags.task, folder, 100, quiet=flags.quiet)}
         evaluate.write_csv(folder / "evaluation.csv", results[str(folder)])

@@ -5,8 +5,9 @@
     python plot_curves.py --figure learning --task p2p                     # figures/fig-learning-p2p.png and .pdf
 
 Each takes seconds. `--runs` takes run folders, or folders with run folders anywhere below; without it, data/results and
-data/runs are read and `--quick` runs left out. Runs of one algorithm, recipe, symmetry and length are a group; groups
-are never averaged together. A run belongs to a printed column when algorithm, N_demos and lambda_BC are the column's.
+data/runs are read and `--quick` runs left out. Runs of one algorithm, recipe, symmetry, variant (what else differs from
+the recipe) and length are a group; groups are never averaged together. A run belongs to a printed column when
+algorithm, N_demos and lambda_BC are the column's.
 
 Per seed, over the agent's own training episodes (demonstrations are not counted):
     R10, R90    mean return of the first and of the last tenth of the episodes (a tenth of n is ceil(n / 10))
@@ -45,8 +46,8 @@ METRICS = {"R10": 2, "R90": 2, "I_R": 2, "T50": 0}  # and the decimals that the 
 WINDOW = 50  # episodes of the running mean, in T50 and in the figures
 CONFIG = {"task": str, "algo": str, "recipe": str, "symmetry": str, "num_demos": int, "lambda_bc": (int, float),
           "seed": int, "epochs": int, "steps_per_epoch": int, "quick": bool}
-CSV_HEADER = ["task", "sweep", "num_demos", "lambda_bc", "algo", "recipe", "symmetry", "total_env_steps", "seeds",
-              "unfinished_seeds", "metric", "paper", "mean", "low", "high", "interval", "na_seeds", "paper_outside"]
+CSV_HEADER = ["task", "sweep", "num_demos", "lambda_bc", "algo", "recipe", "symmetry", "variant", "total_env_steps",
+              "seeds", "unfinished_seeds", "metric", "paper", "mean", "low", "high", "interval", "na_seeds", "paper_outside"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe & Ito: safe for colour-blind eyes
 DASHES = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1.5, 1)))  # one a group, so that colour is free for the column
 
@@ -63,7 +64,7 @@ def fail(message):
 class Run:
     path: Path
     column: tuple  # (algo, N_demos, lambda_BC): what the paper varies
-    group: tuple  # (algo, recipe, symmetry, total environment steps): what we vary
+    group: tuple  # (algo, recipe, symmetry, variant, total environment steps): what we vary
     seed: int
     unfinished: str  # "" or how far it is
     returns: np.ndarray  # (episodes,) undiscounted return of each training episode
@@ -112,7 +113,8 @@ def read_run(folder, config):
     done = read_csv(folder / "progress.csv", ("env_steps",))["env_steps"][-1:].sum()
     total = config["epochs"] * config["steps_per_epoch"]
     return Run(path=folder, column=(config["algo"], config["num_demos"], float(config["lambda_bc"])),
-               group=(config["algo"], config["recipe"], config["symmetry"], total), seed=config["seed"],
+               group=(config["algo"], config["recipe"], config["symmetry"], config.get("variant", ""), total),
+               seed=config["seed"],
                unfinished=f"{done:,.0f} of {total:,} environment steps" if done < total else "",
                returns=episodes["return"])
 
@@ -167,7 +169,7 @@ def by_group(runs, column):
 
 
 def group_label(group):
-    return f"{' '.join(group[:-1])} {group[-1] / 1000:g}k steps"
+    return f"{' '.join(filter(None, group[:-1]))} {group[-1] / 1000:g}k steps"
 
 
 # ------------------------------------------------------------------------------------------ metrics
@@ -261,7 +263,7 @@ def training_csv(task, rows):
     for column, group, members, cells in rows:
         about = dict(zip(("task", "sweep", "algo", "num_demos", "lambda_bc"), (task, column["sweep"], *column["key"]),
                          strict=True))
-        about |= dict(zip(("algo", "recipe", "symmetry", "total_env_steps"), group or (), strict=False))
+        about |= dict(zip(("algo", "recipe", "symmetry", "variant", "total_env_steps"), group or (), strict=False))
         about |= {"seeds": len(members), "unfinished_seeds": sum(bool(run.unfinished) for run in members)}
         for metric, cell in cells.items():
             cell = {k: round(v, 6) if isinstance(v, float) else v for k, v in cell.items() if v == v}  # NaN is blank
