@@ -295,15 +295,13 @@ class Learner:
 
     def __init__(self, flags, obs_dim):
         self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1)
-        cuda = flags.device == "cuda"
         sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.device)
         self.net, self.target = ActorCritic(*sizes), ActorCritic(*sizes)
         self.target.flat.copy_(self.net.flat)
         groups = [dict(params=[self.net.mu], lr=flags.pi_lr), dict(params=[self.net.nu], lr=flags.q_lr)]
-        self.optimizer = torch.optim.Adam(groups, fused=True, capturable=cuda)
-        self.actor = deepcopy(self.net.u).cpu() if cuda else self.net.u  # what acts, on the CPU
+        self.optimizer = torch.optim.Adam(groups, fused=True)
+        self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
-        self.graph, self.eager_updates = None, 0
 
     def block(self, B_o, B_d):
         """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name."""
@@ -315,16 +313,17 @@ class Learner:
             rows_demo = turn(rows_demo, self.widths) if B_d else None
         rows = rows.to(f.device)
         batches = [(o, d) for o, d in zip(rows, rows_demo.to(f.device) if B_d else [None] * n, strict=True)]
-        for batch in batches:
-            measured = self.replay(*batch) if f.device == "cuda" else self.update(*batch)
-        if f.device == "cuda":
+        for rows, rows_demo in batches[:-1]:
+            self.update(rows, rows_demo)
+        measured = self.update(*batches[-1], measure=True)
+        if self.actor is not self.net.u:
             with torch.no_grad():
                 for p, q in zip(self.actor.parameters(), self.net.u.parameters(), strict=True):
                     p.copy_(q)
         return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
 
-    def update(self, rows, rows_demo):
-        """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). Returns 0-d tensors."""
+    def update(self, rows, rows_demo, measure=False):
+        """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). measure: returns tensors."""
         f = self.flags
         s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
         s_demo, a_demo = (s[:0], a[:0]) if rows_demo is None else rows_demo.split(self.widths, dim=-1)[:2]
@@ -351,6 +350,8 @@ class Learner:
         self.optimizer.step()
         with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
             self.target.flat.lerp_(self.net.flat, 1 - f.polyak)
+            if not measure:
+                return None
             return {
                 "L_O": L_O.detach(),
                 "L_BC": L_BC.detach(),
@@ -364,29 +365,6 @@ class Learner:
                 # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
                 "bc_relative_error": ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
             }
-
-    def replay(self, rows, rows_demo):
-        """update() on a GPU, recorded once and replayed: launching its hundreds of kernels one by one takes longer."""
-        if self.graph is None and self.eager_updates < 3:  # the first few warm up what may not be recorded
-            self.eager_updates += 1
-            self.fixed = [x if x is None else x.clone() for x in (rows, rows_demo)]
-            stream = torch.cuda.Stream()
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
-                measured = self.update(*self.fixed)
-            torch.cuda.current_stream().wait_stream(stream)
-            return measured
-        if len(rows) != len(self.fixed[0]):
-            return self.update(rows, rows_demo)
-        if self.graph is None:
-            self.graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph):
-                self.measured = self.update(*self.fixed)
-        for fixed, new in zip(self.fixed, (rows, rows_demo), strict=True):
-            if new is not None:
-                fixed.copy_(new)
-        self.graph.replay()
-        return self.measured
 
     def state(self):
         return {

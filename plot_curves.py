@@ -47,7 +47,8 @@ WINDOW = 50  # episodes of the running mean, in T50 and in the figures
 CONFIG = {"task": str, "algo": str, "recipe": str, "symmetry": str, "num_demos": int, "lambda_bc": (int, float),
           "seed": int, "epochs": int, "steps_per_epoch": int, "quick": bool}
 CSV_HEADER = ["task", "sweep", "num_demos", "lambda_bc", "algo", "recipe", "symmetry", "variant", "total_env_steps",
-              "seeds", "unfinished_seeds", "metric", "paper", "mean", "low", "high", "interval", "na_seeds", "paper_outside"]
+              "seeds", "unfinished_seeds", "metric", "paper", "mean", "low", "high", "interval", "na_seeds",
+              "paper_outside"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe & Ito: safe for colour-blind eyes
 DASHES = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1.5, 1)))  # one a group, so that colour is free for the column
 
