@@ -373,7 +373,7 @@ class KinovaEnv(gymnasium.Env):
             )
         if self.render_mode == "human":
             self._show()
-        e = [g - p for g, p in zip(self.goal, self._tcp, strict=True)]
+        e = [g - p for g, p in zip(self.goal, self.tcp, strict=True)]
         info = {"is_success": False, "collision": "", "grasped": False, "distance": math.hypot(*e), "effort": 0.0}
         info["reward_terms"] = dict.fromkeys(("distance", "effort", "reaching", "collision", "grasping"), 0.0)
         if self.partition is not None:
@@ -383,7 +383,7 @@ class KinovaEnv(gymnasium.Env):
     def _place(self, posture, cube):
         for joint, angle in zip(ACTIVE_JOINTS, posture.tolist(), strict=True):
             pybullet.resetJointState(self._robot, joint, angle, 0.0, physicsClientId=self._client)
-        self.q, self.q_dot, self._tcp = posture.tolist(), [0.0] * 4, tcp(posture.tolist())
+        self.q, self.q_dot, self.tcp = posture.tolist(), [0.0] * 4, tcp(posture.tolist())
         if cube is not None:
             self.cube = cartesian(*cube).tolist()
             self._cube_yaw = cube[0]
@@ -420,7 +420,7 @@ class KinovaEnv(gymnasium.Env):
         j1, j2, j3, j5 = pybullet.getJointStates(self._robot, ACTIVE_JOINTS, physicsClientId=client)
         self.q, self.q_dot = (j1[0], j2[0], j3[0], j5[0]), (j1[1], j2[1], j3[1], j5[1])
         tau_hat = math.hypot(j1[3] / TAU_MAX[0], j2[3] / TAU_MAX[1], j3[3] / TAU_MAX[2], j5[3] / TAU_MAX[3])
-        x, y, z = self._tcp = tcp(self.q)
+        x, y, z = self.tcp = tcp(self.q)
         gx, gy, gz = self.goal
         e = (gx - x, gy - y, gz - z)
         distance = to_go = math.hypot(*e)
@@ -429,9 +429,9 @@ class KinovaEnv(gymnasium.Env):
         if self.row.cube == "object":
             if not self.grasped:
                 first_grasp = self.grasped = self._grasps()
-                to_go = distance if self.grasped else math.dist(self.cube, self._tcp)
+                to_go = distance if self.grasped else math.dist(self.cube, self.tcp)
             if self.grasped:
-                self.cube = list(self._tcp)
+                self.cube = list(self.tcp)
                 if self.render_mode:
                     self._move_cube(-self.q[0])
         success = distance < EPSILON and (self.grasped or self.row.cube != "object")
@@ -495,7 +495,7 @@ class KinovaEnv(gymnasium.Env):
 
     def _grasps(self):
         """r^grsp: TCP within EPSILON of the cube and the gripper's orientation within EPSILON_Q of the cube's."""
-        if math.dist(self.cube, self._tcp) > EPSILON:
+        if math.dist(self.cube, self.tcp) > EPSILON:
             return False
         yaw = -self.q[0] - self._cube_yaw
         pitch = math.pi / 2 - (self.q[1] - self.q[2] - self.q[3])

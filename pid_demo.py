@@ -12,6 +12,7 @@ lengths, `fast` reaches in under half the time (see the README for both, measure
 
 import argparse
 import json
+import math
 import os
 from pathlib import Path
 
@@ -20,8 +21,11 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
-from kinova_env import STAGES, TASKS, TIME_STEP, postures, wrap
+from kinova_env import STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
 
+CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it on P&P
+RETRACT = 0.35  # m, radius to which it draws back before it rises beside a cube on P2P-O
+RADIUS = 0.05  # m, within which a way point counts as reached
 GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
 
 
@@ -33,23 +37,52 @@ class PID:
     saturated (anti-windup).
     """
 
-    def __init__(self, env, gains="authors"):
+    def __init__(self, env, gains="authors", clearance=CLEARANCE, radius=RADIUS):
         self.env = env.unwrapped
         self.K_P, self.K_D, self.K_I = GAINS[gains] if isinstance(gains, str) else gains
+        self.clearance, self.radius = clearance, radius
         self._episode = None
 
-    def _set_points(self):
-        """Joint set points of the episode, in order (`sec:demo`): position only, the posture nearest to the present."""
-        q = np.array(self.env.q)
-        found = postures(self.env.goal)
-        error = np.abs(wrap(found[:, 0] - q[0])) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1)
-        return [found[np.argmin(error)]]
+    def _plan(self):
+        """The episode's set points, in order: [(name, (M, 4) postures to choose from)] (`sec:demo`)."""
+        env = self.env
+        goal = ("goal", postures(env.goal))
+        if env.row.cube == "obstacle":  # rise above the cube, cross, descend
+            x, y, z = env.tcp
+            height = max(z, env.goal[2], env.cube[2] + self.clearance)
+            cross = ("cross", postures((*env.goal[:2], height)))
+            if math.dist((x, y), env.cube[:2]) > self.clearance:
+                return [("rise", postures((x, y, height))), cross, goal]
+            x, y = x * RETRACT / math.hypot(x, y), y * RETRACT / math.hypot(x, y)  # no room: draw back first
+            return [("retract", postures((x, y, z))), ("rise", postures((x, y, height))), cross, goal]
+        if env.row.cube == "object":  # approach along the cube's horizontal axis, grasp, carry
+            x, y, z = env.cube
+            back = 1 - self.clearance / math.hypot(x, y)
+            grasp = grasp_postures(env.cube)
+            approach = grasp_postures((back * x, back * y, z))
+            return [("approach", approach), ("grasp", grasp), goal]
+        return [goal]
+
+    def _next(self):
+        """Takes the next set point: of its postures the one nearest to the present."""
+        self._name, found = self._points.pop(0)
+        if len(found):
+            q = np.array(self.env.q)
+            error = wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1)
+            self._q_sp = found[np.argmin(error)]
+            self._at = np.array(tcp(self._q_sp))
+            self._integral = np.zeros(4)
+        else:  # out of reach: a way point is left out (the goal never is)
+            self._next()
 
     def act(self):
         if self._episode != self.env.episode:
-            self._episode = self.env.episode
-            self._q_sp = self._set_points()[0]
-            self._integral = np.zeros(4)
+            self._episode, self._points = self.env.episode, self._plan()
+            self._next()
+        while self._points and (
+            self.env.grasped if self._name == "grasp" else math.dist(self._at, self.env.tcp) < self.radius
+        ):
+            self._next()
         q_tilde = self._q_sp - self.env.q
         q_tilde[0] = wrap(q_tilde[0])  # joint 1 turns without end: the shortest way round
         integral = self._integral + q_tilde * TIME_STEP

@@ -1,0 +1,914 @@
+"""kinova_env.py: the robot against DESIGN's table and PyBullet, the class docstring against the code, the tasks."""
+
+import functools
+import math
+import subprocess
+import sys
+import warnings
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pybullet
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import kinova_env
+from kinova_env import OBSERVATION, STAGES, TASKS, URDF, KinovaEnv, cartesian, postures, start_posture, tcp, wrap
+
+PI = math.pi
+CUBES = [task for task in TASKS if TASKS[task].cube]
+ZERO = np.zeros(4, dtype=np.float32)
+FAR = {"start": (0.3, 0.52, 0.42), "goal": (1.6, 0.5, 0.4)}  # nothing happens near the start
+FOLD = np.array([0.7, 1.0, -1.0, -1.0], dtype=np.float32)  # folds the gripper into the base
+TURN = np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32)
+
+
+@pytest.fixture
+def make():
+    """gymnasium.make by the task's short name; closed at the end of the test."""
+    opened = []
+
+    def make_(task, **settings):
+        opened.append(gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **settings))
+        return opened[-1]
+
+    yield make_
+    for env in opened:
+        env.close()
+
+
+@pytest.fixture
+def arm():
+    """(body, client): the URDF alone in a simulator of the test's own, with gravity, free of kinova_env."""
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER
+    flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+    body = pybullet.loadURDF(str(URDF), useFixedBase=True, flags=flags, physicsClientId=client)
+    yield body, client
+    pybullet.disconnect(physicsClientId=client)
+
+
+def pose(arm, q):
+    """Puts the test's own arm into a posture."""
+    body, client = arm
+    for joint, angle in zip((0, 1, 2, 4), q, strict=True):
+        pybullet.resetJointState(body, joint, angle, physicsClientId=client)
+
+
+def far(task, **options):
+    """Explicit options of an episode in which nothing happens near the start."""
+    return FAR | ({"object": (2.2, 0.5, 0.45)} if TASKS[task].cube else {}) | options
+
+
+def part(obs, name):
+    """The entries of an observation that DESIGN's state calls `name`, by the indices written there."""
+    indices = {"q": (0, 4), "sin q": (4, 8), "cos q": (8, 12), "q_dot": (12, 16), "P_g": (16, 19), "e": (19, 22)}
+    begin, end = (indices | {"P_o": (22, 25)})[name]
+    return obs[..., begin:end].astype(float)
+
+
+def cylinder(position):
+    return math.atan2(position[1], position[0]), math.hypot(position[0], position[1]), position[2]
+
+
+def rollout(env, actions, **reset):
+    """[(obs, reward, terminated, truncated, info)] of an episode; the reset's row first."""
+    obs, info = env.reset(**reset)
+    rows = [(obs, 0.0, False, False, info)]
+    for action in actions:
+        rows.append(env.step(action))
+        if rows[-1][2] or rows[-1][3]:
+            break
+    return rows
+
+
+def random_actions(seed, steps=200):
+    """Random actions, each held for ten steps, so that the arm gets somewhere."""
+    return np.random.default_rng(seed).uniform(-1, 1, (steps // 10, 4)).astype(np.float32).repeat(10, axis=0)
+
+
+def assert_same_bits(rows, others):
+    assert len(rows) == len(others)
+    for (obs, *rest), (other, *other_rest) in zip(rows, others, strict=True):
+        assert obs.tobytes() == other.tobytes()
+        assert rest == other_rest
+
+
+# ---- the robot -------------------------------------------------------------------------------------------------------
+
+JOINTS = {  # DESIGN, section 2: xyz (m), rpy (multiples of pi), limit (rad, inf: continuous, 0: fixed), effort (N m)
+    "Actuator1": ("base_link", (0, 0, 0.15643), (1, 0, 0), math.inf, 39),
+    "Actuator2": ("shoulder_link", (0, 0.005375, -0.12838), (0.5, 0, 0), 2.41, 39),
+    "Actuator3": ("bicep_link", (0, -0.41, 0), (1, 0, 0), 2.66, 39),
+    "Actuator4": ("forearm_link", (0, 0.20843, -0.006375), (0.5, 0, 0), 0, None),
+    "Actuator5": ("spherical_wrist_1_link", (0, -0.00017505, -0.10593), (-0.5, 0, 0), 2.23, 9),
+    "Actuator6": ("spherical_wrist_2_link", (0, 0.10593, -0.00017505), (0.5, -0.5, 0), 0, None),
+    "EndEffector": ("bracelet_link", (0, 0, -0.061525), (1, 0, -1), 0, None),
+}
+LINKS = {  # mass (kg), centre of mass (m), ixx, iyy, izz, iyz (kg m^2; None: "products <= 4.5e-4")
+    "base_link": (1.697, (-0.000648, -0.000166, 0.084487), (0.004622, 0.004495, 0.002079), None),
+    "shoulder_link": (1.377, (-2.3e-5, -0.010364, -0.07336), (0.00457, 0.004831, 0.001409), 0.000448),
+    "bicep_link": (1.262, (3.5e-5, -0.208207, -0.01889), (0.046752, 0.00085, 0.047188), None),
+    "forearm_link": (0.930, (1.8e-5, 0.076168, -0.01397), (0.008292, 0.000628, 0.008464), 0.000432),
+    "spherical_wrist_1_link": (0.6781, (-1e-6, 0.008486, -0.062937), (0.001645, 0.001666, 0.000389), -0.000234),
+    "spherical_wrist_2_link": (0.678, (-1e-6, 0.046429, -0.008704), (0.001685, 0.0004, 0.001696), 0.000255),
+    "bracelet_link": (0.500, (0.000281, 0.011402, -0.029798), (0.000587, 0.000369, 0.000609), -0.000118),
+    "gripper_link": (0.925, (0, 0, 0.05), None, None),
+}
+ROBOT = ElementTree.parse(URDF).getroot()
+
+
+def numbers(text):
+    return tuple(float(word) for word in text.split())
+
+
+def joint_of(name):
+    return ROBOT.find(f"joint[@name='{name}']")
+
+
+def test_urdf_has_the_joints_and_links_of_designs_tables_and_no_other():
+    assert [joint.get("name") for joint in ROBOT.iter("joint")] == list(JOINTS)
+    assert [link.get("name") for link in ROBOT.iter("link")] == list(LINKS)
+    chain = list(LINKS)
+    for (name, row), child in zip(JOINTS.items(), chain[1:], strict=True):
+        assert (joint_of(name).find("parent").get("link"), joint_of(name).find("child").get("link")) == (row[0], child)
+
+
+@pytest.mark.parametrize("name", JOINTS)
+def test_joint_frames_limits_and_efforts_of_the_urdf_are_those_of_designs_table_with_exact_pi(name):
+    _, xyz, rpy, limit, effort = JOINTS[name]
+    joint = joint_of(name)
+    assert numbers(joint.find("origin").get("xyz")) == xyz
+    assert numbers(joint.find("origin").get("rpy")) == tuple(multiple * math.pi for multiple in rpy)
+    assert joint.get("type") == {math.inf: "continuous", 0: "fixed"}.get(limit, "revolute")
+    if limit:
+        assert numbers(joint.find("axis").get("xyz")) == (0, 0, 1)
+        assert float(joint.find("limit").get("effort")) == effort
+    if 0 < limit < math.inf:
+        assert [float(joint.find("limit").get(end)) for end in ("lower", "upper")] == [-limit, limit]
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_masses_centres_and_inertias_of_the_urdf_are_those_of_designs_table(name):
+    mass, centre, diagonal, iyz = LINKS[name]
+    inertial = ROBOT.find(f"link[@name='{name}']/inertial")
+    assert float(inertial.find("mass").get("value")) == mass
+    assert numbers(inertial.find("origin").get("xyz")) == centre
+    assert inertial.find("origin").get("rpy") is None
+    inertia = {key: float(value) for key, value in inertial.find("inertia").attrib.items()}
+    if diagonal:
+        assert (inertia["ixx"], inertia["iyy"], inertia["izz"]) == diagonal
+    if iyz:
+        assert inertia["iyz"] == iyz
+    assert all(abs(inertia[key]) <= 4.5e-4 for key in ("ixy", "ixz", "iyz"))
+
+
+def test_pybullet_loads_every_mass_and_centre_of_mass_as_written(arm):
+    body, client = arm
+    for link, (mass, centre, *_) in enumerate(LINKS.values(), start=-1):
+        dynamics = pybullet.getDynamicsInfo(body, link, physicsClientId=client)
+        # a fixed base reads as mass 0
+        assert dynamics[0] == (0 if link == -1 else mass)
+        assert dynamics[3] == pytest.approx(centre, abs=1e-9)
+
+
+def test_constants_of_the_module_are_those_of_the_urdf(arm):
+    body, client = arm
+    xyz = {name: row[1] for name, row in JOINTS.items()}
+    joints = [pybullet.getJointInfo(body, j, physicsClientId=client) for j in range(len(JOINTS))]
+    active = [joint_of(joints[j][1].decode()) for j in kinova_env.ACTIVE_JOINTS]
+    assert [joint.get("name") for joint in active] == ["Actuator1", "Actuator2", "Actuator3", "Actuator5"]
+    assert list(kinova_env.TAU_MAX) == [float(joint.find("limit").get("effort")) for joint in active]
+    assert list(kinova_env.VELOCITY_MAX) == [float(joint.find("limit").get("velocity")) for joint in active]
+    assert list(kinova_env.JOINT_LIMITS) == [float(joint.find("limit").get("upper", "inf")) for joint in active]
+    assert joints[kinova_env.GRIPPER_LINK][12].decode() == "gripper_link"
+    assert xyz["Actuator1"][2] - xyz["Actuator2"][2] == kinova_env.SHOULDER_HEIGHT
+    assert -xyz["Actuator3"][1] == kinova_env.UPPER_ARM
+    assert xyz["Actuator4"][1] - xyz["Actuator5"][2] == kinova_env.FOREARM
+    assert xyz["Actuator6"][1] - xyz["EndEffector"][2] + 0.149 == kinova_env.HAND
+    side = -xyz["Actuator2"][1] - xyz["Actuator4"][2] - xyz["Actuator5"][1] - xyz["Actuator6"][2]
+    assert abs(kinova_env.SIDE - side) < 1e-15
+
+
+def test_base_and_shoulder_collision_shapes_are_symmetric_about_the_base_axis():
+    for name in ("base_link", "shoulder_link"):
+        for shape in ROBOT.findall(f"link[@name='{name}']/collision"):
+            assert shape.find("geometry/cylinder") is not None
+            assert numbers(shape.find("origin").get("xyz"))[:2] == (0, 0)
+            assert shape.find("origin").get("rpy") is None
+
+
+def test_tcp_is_pybullets_own_link_state_at_random_postures(arm):
+    body, client = arm
+    for q in np.random.default_rng(0).uniform(-1, 1, (200, 4)) * (PI, 2.41, 2.66, 2.23):
+        pose(arm, q)
+        state = pybullet.getLinkState(body, 6, computeForwardKinematics=True, physicsClientId=client)
+        approach = np.reshape(pybullet.getMatrixFromQuaternion(state[5]), (3, 3))[:, 2]
+        # 1e-7 is what PyBullet's own quaternions and single-precision URDF numbers leave
+        np.testing.assert_allclose(tcp(q), state[4] + 0.149 * approach, rtol=0, atol=3e-7)
+
+
+def test_flange_and_tcp_of_designs_check_posture(arm):
+    body, client = arm
+    q = (0, *np.radians((15, -130, 55)))
+    pose(arm, q)
+    flange = pybullet.getLinkState(body, 6, computeForwardKinematics=True, physicsClientId=client)[4]
+    assert flange == pytest.approx((0.4539, 0.0014, 0.4233), abs=5.1e-5)
+    assert tcp(q) == pytest.approx((0.6029, 0.0014, 0.4233), abs=5.1e-5)
+
+
+@pytest.mark.parametrize(
+    "rho, z, degrees", [(0.52, 0.42, (6.48, -143.50, 59.98)), (0.50, 0.45, (-1.95, -143.03, 51.08))]
+)
+@pytest.mark.parametrize("theta", [-3.0, -PI / 4, 0.0, PI / 4, 2.0])
+def test_start_posture_is_designs_solution_with_the_tool_horizontal_at_the_place_asked(theta, rho, z, degrees):
+    q = start_posture(theta, rho, z)
+    assert np.degrees(q[1:]) == pytest.approx(degrees, abs=0.0051)
+    # -theta, but for the 1.35 mm by which the TCP lies beside the arm's plane
+    assert wrap(q[0] + theta) == pytest.approx(math.asin(0.00135 / rho), abs=2e-6)
+    assert q[1] - q[2] - q[3] == pytest.approx(PI / 2, abs=1e-12)
+    np.testing.assert_allclose(tcp(q), (rho * math.cos(theta), rho * math.sin(theta), z), rtol=0, atol=1e-9)
+
+
+def test_fingers_open_horizontally_and_the_hand_points_radially_outward_at_every_start(arm):
+    body, client = arm
+    for theta in (-3.0, -PI / 4, 0.0, PI / 4, 2.0):
+        pose(arm, start_posture(theta, 0.52, 0.42))
+        state = pybullet.getLinkState(body, 6, computeForwardKinematics=True, physicsClientId=client)
+        frame = np.reshape(pybullet.getMatrixFromQuaternion(state[5]), (3, 3))
+        assert abs(frame[2, 0]) < 1e-6  # the fingers open along x
+        np.testing.assert_allclose(frame[:, 2], (math.cos(theta), math.sin(theta), 0), rtol=0, atol=3e-3)
+
+
+def test_inverse_kinematics_is_exact_and_within_the_limits_at_random_reachable_points():
+    reached = 0
+    for q in np.random.default_rng(1).uniform(-1, 1, (300, 4)) * (PI, 2.41, 2.66, 2.23):
+        place = tcp(q)
+        if wrap(math.atan2(place[1], place[0]) + q[0]) ** 2 > 0.1:
+            continue  # reaches over its own back
+        reached += 1
+        pitch = PI / 2 - (q[1] - q[2] - q[3])
+        for found in (postures(place), postures(place, pitch)):
+            assert found.shape[1] == 4
+            assert np.all(np.abs(found[:, 1:]) <= (2.41, 2.66, 2.23))
+            assert max((math.dist(tcp(one), place) for one in found), default=0) <= 1e-9
+        # the posture it came from is among those of its own pitch
+        assert min(np.abs(wrap(one - q)).max() for one in found) < 1e-6
+    assert reached > 100
+
+
+def test_every_goal_of_every_stage_is_reachable():
+    for theta, rho, z in np.random.default_rng(2).uniform((-PI, 0.3, 0.25), (PI, 0.7, 0.65), (300, 3)):
+        assert len(postures(cartesian(theta, rho, z)))
+
+
+@pytest.mark.parametrize("place", [(1.4, 0, 0.4), (0, 0, 0.8), (0, -1, -0.9)])
+def test_inverse_kinematics_of_an_unreachable_point_is_empty(place):
+    assert postures(place).shape == (0, 4)
+
+
+def test_wrap_takes_every_angle_to_the_half_open_circle():
+    angles = np.linspace(-20, 20, 1001)
+    wrapped = wrap(angles)
+    assert np.all((wrapped >= -PI) & (wrapped < PI))
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), rtol=0, atol=1e-12)
+    assert wrap(PI) == wrap(-PI) == -PI
+
+
+# ---- arguments -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "settings, named",
+    [
+        ({"task": "reach"}, "task 'reach'"),
+        ({"stage": "Train"}, "stage 'Train'"),
+        ({"partitions": 0}, "partitions 0"),
+        ({"partitions": 2.5}, "partitions 2.5"),
+        ({"render_mode": "ansi"}, "render_mode 'ansi'"),
+    ],
+)
+def test_wrong_argument_is_a_value_error_that_names_it(settings, named):
+    with pytest.raises(ValueError, match=named):
+        KinovaEnv(**settings)
+
+
+def test_window_without_a_display_is_a_value_error_that_says_so(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(ValueError, match="render_mode 'human'.*DISPLAY"):
+        KinovaEnv(render_mode="human")
+
+
+@pytest.mark.parametrize(
+    "task, stage, options, named",
+    [
+        ("p2p", "train", {"start": (0, 1.5, 0.42)}, "start .*1.5"),
+        ("p2p", "train", {"start": (0, 0.35, 0.25)}, "start .*0.35"),  # in reach, but not with a horizontal tool
+        ("p2p", "train", {"goal": (0, 1.5, 0.42)}, "goal .*1.5"),
+        ("p2p", "train", {"goal": (0, 0.0, 0.42)}, "goal .*0.0"),
+        ("p2po", "train", {"object": (0, 0.5, 1.5)}, "object .*1.5"),
+        ("pnp", "train", {"object": (0, 0.5, 1.5)}, "object .*1.5"),
+        ("pnp", "train", {"object": (0, 0.35, 0.25)}, "object .*0.35"),  # in reach, but not to be grasped
+        ("p2p", "train", {"goal": (0, 0.5)}, "goal .*three"),
+        ("p2p", "train", {"start": (0, 0.5, 0.4, 0)}, "start .*three"),
+        ("p2p", "train", {"goal": (0, math.nan, 0.4)}, "goal .*nan"),
+        ("p2p", "train", {"goal": (math.inf, 0.5, 0.4)}, "goal .*inf"),
+        ("p2p", "train", {"object": (0, 0.5, 0.42)}, "object"),
+        ("p2p", "train", {"gaol": (0, 0.5, 0.42)}, "gaol"),
+        ("p2p", "train", {"partition": 0}, "partition.*train"),
+        ("p2p", "test", {"partition": 0}, "partition.*test"),
+        ("p2p", "demo", {"partition": 4}, "partition 4"),
+        ("p2p", "demo", {"partition": -1}, "partition -1"),
+        ("p2p", "demo", {"partition": 0.5}, "partition 0.5"),
+    ],
+)
+def test_wrong_or_unreachable_option_is_a_value_error_that_names_it(make, task, stage, options, named):
+    env = make(task, stage=stage)
+    with pytest.raises(ValueError, match=named):
+        env.reset(seed=0, options=options)
+
+
+def test_place_that_is_no_start_and_no_cube_may_be_a_goal(make):
+    env = make("pnp")
+    obs, _ = env.reset(seed=0, options={"goal": (0, 0.35, 0.25)})
+    np.testing.assert_allclose(part(obs, "P_g"), (0.35, 0, 0.25), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "task, stage, options",
+    [
+        ("p2p", "train", {"goal": (PI / 4, 0.52, 0.42)}),  # at the start, which is not drawn on this stage
+        ("p2po", "train", {"start": (0, 0.5, 0.42), "goal": (0, 0.5, 0.42)}),
+        ("p2po", "train", {"object": (PI / 4, 0.45, 0.42)}),  # in the palm
+        ("pnp", "demo", {"partition": 0, "object": (2.0, 0.5, 0.42)}),  # outside the sector
+    ],
+)
+def test_explicit_options_that_no_draw_would_give_begin_an_episode(make, monkeypatch, task, stage, options):
+    env = make(task, stage=stage)
+    draw, count = KinovaEnv._draw, [0]
+
+    def counted(*arguments):
+        count[0] += 1
+        assert count[0] < 3000, "reset draws for ever"
+        return draw(*arguments)
+
+    monkeypatch.setattr(KinovaEnv, "_draw", counted)
+    obs, _ = env.reset(seed=0, options=options)
+    named = {"goal": part(obs, "P_g"), "object": part(obs, "P_o"), "start": part(obs, "P_g") - part(obs, "e")}
+    for name in set(options) - {"partition"}:
+        np.testing.assert_allclose(named[name], cartesian(*options[name]), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_nan_action_is_a_value_error(make, task):
+    env = make(task)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="NaN"):
+        env.step(np.array([0, 0, math.nan, 0], dtype=np.float32))
+
+
+# ---- the class docstring against the code ----------------------------------------------------------------------------
+
+
+def tables(text):
+    """The rows of each table of a docstring by the section it stands in, without the header."""
+    found, section = {}, None
+    for line in (line.strip() for line in text.splitlines()):
+        if line.startswith("## "):
+            section = line[3:]
+        elif line.startswith("|"):
+            found.setdefault(section, []).append([cell.strip() for cell in line.strip("|").split("|")])
+    return {section: rows[2:] for section, rows in found.items()}
+
+
+DOC = tables(KinovaEnv.__doc__)
+
+
+def intervals(cell):
+    """[(low, high), ...] of a cell like "[-pi, pi), [0.3, 0.7)"."""
+    pairs = [piece.split("[")[1].split(",") for piece in cell.split(")") if "[" in piece]
+    return [tuple({"pi": PI, "-pi": -PI}.get(end.strip()) or float(end) for end in pair) for pair in pairs]
+
+
+def test_action_table_of_the_docstring_is_the_action_space(make, arm):
+    body, client = arm
+    space = make("p2p").action_space
+    assert space == gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+    assert [int(row[0]) for row in DOC["Action space"]] == [0, 1, 2, 3]
+    names = [pybullet.getJointInfo(body, j, physicsClientId=client)[1].decode() for j in kinova_env.ACTIVE_JOINTS]
+    assert [row[1] for row in DOC["Action space"]] == names
+    assert [float(row[2]) for row in DOC["Action space"]] == list(kinova_env.VELOCITY_MAX)
+    assert [float(row[3]) for row in DOC["Action space"]] == list(kinova_env.TAU_MAX)
+
+
+@pytest.mark.parametrize("task, speed", [("p2p", 0.5), ("p2po", 1.0), ("pnp", 1.0)])
+@pytest.mark.parametrize("joint", range(4))
+def test_action_one_is_the_joint_velocity_of_the_docstring_times_the_tasks_speed(make, task, speed, joint):
+    env = make(task)
+    env.reset(seed=0, options=far(task))
+    action = np.eye(4, dtype=np.float32)[joint]
+    for _ in range(12):
+        obs, *_ = env.step(action)
+    expected = np.zeros(4)
+    expected[joint] = float(DOC["Action space"][joint][2]) * speed
+    np.testing.assert_allclose(part(obs, "q_dot"), expected, rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_actions_beyond_one_are_clipped(make, task):
+    beyond, within = (
+        rollout(make(task), [scale * TURN - scale * FOLD] * 15, options=far(task)) for scale in (1e6, 100.0)
+    )
+    clipped = rollout(make(task), [np.sign(TURN - FOLD)] * 15, options=far(task))
+    assert_same_bits(beyond, clipped)
+    assert_same_bits(within, clipped)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_step_is_a_fiftieth_of_a_second(make, task):
+    rows = rollout(make(task), [0.5 * TURN] * 30, options=far(task))
+    q = np.array([part(obs, "q")[0] for obs, *_ in rows])
+    q_dot = np.array([part(obs, "q_dot")[0] for obs, *_ in rows])
+    np.testing.assert_allclose(np.diff(q), q_dot[1:] / 50, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("task, width", [("p2p", 22), ("p2po", 25), ("pnp", 25)])
+def test_observation_table_of_the_docstring_is_the_observation_space(make, task, width):
+    rows = DOC["Observation space"] if width == 25 else DOC["Observation space"][:-1]
+    begin = 0
+    low, high = [], []
+    for (indices, name, _, bound, _), (own, own_width, _) in zip(rows, OBSERVATION[task], strict=True):
+        first, last = (int(i) for i in indices.split("-"))
+        assert (name, first, last - first + 1) == (own, begin, own_width)
+        begin += own_width
+        high += [PI if bound == "pi" else float(bound)] * own_width
+    low = [-bound for bound in high]
+    space = make(task).observation_space
+    assert space == gymnasium.spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+    assert space.shape == (width,) == (begin,)
+
+
+def test_reward_table_of_the_docstring_is_that_of_the_module(make):
+    terms = dict(DOC["Rewards"])
+    assert list(terms) == list(make("p2p").reset(seed=0)[1]["reward_terms"])
+    assert {name: float(text.split()[0]) for name, text in terms.items()} == {
+        "distance": -kinova_env.ALPHA_1,
+        "effort": -kinova_env.ALPHA_2,
+        "reaching": kinova_env.R_1,
+        "collision": -kinova_env.R_2,
+        "grasping": kinova_env.R_3,
+    }
+    assert (kinova_env.ALPHA_1, kinova_env.ALPHA_2) == (2e-3, 1e-3)  # the paper's, sec:def_reward
+    assert (kinova_env.R_1, kinova_env.R_2, kinova_env.R_3) == (10, 2, 2)
+    assert kinova_env.EPSILON == 0.05
+
+
+@pytest.mark.parametrize("task, horizon", [("p2p", 400), ("p2po", 500), ("pnp", 800)])
+def test_registered_horizon_and_largest_return_are_the_papers(make, task, horizon):
+    assert gymnasium.spec(TASKS[task].env_id).max_episode_steps == TASKS[task].horizon == horizon
+    assert str(horizon) in KinovaEnv.__doc__.split("## Episode end")[1]
+    assert TASKS[task].return_max == (12 if task == "pnp" else 10)
+
+
+# ---- start of an episode ---------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def draws(task, stage, K=4, count=300):
+    """Observations (count, width) and partitions (-1: none) of so many resets, the first seeded."""
+    env = KinovaEnv(task, stage, K)
+    results = [env.reset(seed=3 if n == 0 else None) for n in range(count)]
+    env.close()
+    return np.array([obs for obs, _ in results]), np.array([info.get("partition", -1) for _, info in results])
+
+
+def assert_fills(values, low, high):
+    """Values are uniform-looking in [low, high): all inside, both ends nearly reached, the middle in the middle."""
+    values, margin = np.asarray(values), 0.05 * (high - low)
+    assert values.min() >= low - 1e-6 and values.max() < high + 1e-6
+    assert values.min() < low + margin and values.max() > high - margin
+    assert np.mean(values) == pytest.approx((low + high) / 2, abs=0.1 * (high - low))
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("stage", ["train", "test"])
+def test_start_and_goal_of_train_and_test_episodes_follow_the_table(task, stage):
+    obs, partitions = draws(task, stage)
+    theta = {"train": PI / 4, "test": -PI / 4 if task == "p2p" else -PI / 2}[stage]
+    start = (theta, 0.52, 0.42) if stage == "train" else (theta, 0.5, 0.45)
+    np.testing.assert_allclose(part(obs, "q"), np.tile(start_posture(*start), (len(obs), 1)), rtol=0, atol=1e-6)
+    goals = np.array([cylinder(goal) for goal in part(obs, "P_g")])
+    for column, (low, high) in zip(goals.T, [(-PI, PI), (0.3, 0.7), (0.25, 0.65)], strict=True):
+        assert_fills(column, low, high)
+    assert set(partitions) == {-1}  # only demonstrations have one
+    row = {row[0]: row[1:] for row in DOC["Starting state"]}[stage]
+    assert intervals(row[1] if stage == "train" else {r[0]: r for r in DOC["Starting state"]}["train"][2]) == [
+        (-PI, PI),
+        (0.3, 0.7),
+        (0.25, 0.65),
+    ]
+    assert row[0] == {"train": "pi/4, 0.52, 0.42", "test": "-pi/4 (P2P) or -pi/2, 0.5, 0.45"}[stage]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("K", [4, 3])
+def test_start_and_goal_of_demonstrations_follow_the_table_for_every_number_of_partitions(task, K):
+    obs, partitions = draws(task, "demo", K)
+    counts = np.bincount(partitions, minlength=K)
+    assert len(counts) == K and counts.min() > len(obs) / K * 0.7  # uniform
+    centre = (partitions - (0.5 if task == "p2p" else 0)) * 2 * PI / K
+    mean = np.array([start_posture(theta, 0.52, 0.42) for theta in centre])
+    for jitter in wrap(part(obs, "q") - mean).T:
+        assert_fills(jitter, -0.02, 0.02)
+    goals = np.array([cylinder(goal) for goal in part(obs, "P_g")])
+    assert_fills(wrap(goals[:, 0] - centre), -PI / K, PI / K if task == "p2p" else 0)
+    assert_fills(goals[:, 1], 0.4, 0.6)
+    assert_fills(goals[:, 2], 0.35, 0.55)
+    start, goal = DOC["Starting state"][-1][1:]
+    assert start.endswith("0.52, 0.42, each joint +- 0.02 rad") and intervals(goal) == [(0.4, 0.6), (0.35, 0.55)]
+
+
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("task", CUBES)
+def test_cube_lies_beside_the_goal_as_the_table_says(task, stage):
+    obs, partitions = draws(task, stage)
+    goals, cubes = ([cylinder(place) for place in part(obs, name)] for name in ("P_g", "P_o"))
+    theta, rho, z = (np.array(cubes) - goals).T
+    theta, rho = wrap(theta), np.array(cubes)[:, 1]
+    assert_fills(np.abs(theta), PI / 12, PI / 6)
+    assert min(np.mean(theta > 0), np.mean(theta < 0)) > 0.1  # both sides
+    assert rho.min() >= 0.4 - 1e-6 and rho.max() < 0.6
+    assert z.min() >= -0.1 - 1e-6 and z.max() < 0.1 + 1e-6 and np.ptp(z) > 0.18 and np.ptp(rho) > 0.18
+    if task == "pnp" and stage == "demo":  # such cubes are drawn again until they lie in the sector
+        assert np.abs(wrap(np.array(cubes)[:, 0] - partitions * PI / 2)).max() <= PI / 4 + 1e-6
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_sampled_episode_never_begins_at_the_goal_or_in_collision(arm, task):
+    body, client = arm
+    pybullet.setCollisionFilterPair(body, body, 4, 6, 0, physicsClientId=client)  # held together by Actuator6
+    box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.02] * 3, physicsClientId=client)
+    cube = pybullet.createMultiBody(0, box, physicsClientId=client) if task in CUBES else None
+    obs, _ = draws(task, "demo", count=500)
+    assert np.linalg.norm(part(obs, "e"), axis=1).min() >= 0.05
+    for row in obs:
+        pose(arm, part(row, "q"))
+        if cube is not None:
+            yaw = cylinder(part(row, "P_o"))[0]
+            turn = pybullet.getQuaternionFromEuler([0, 0, yaw])
+            pybullet.resetBasePositionAndOrientation(cube, part(row, "P_o"), turn, physicsClientId=client)
+        pybullet.performCollisionDetection(physicsClientId=client)
+        assert not pybullet.getContactPoints(body, body, physicsClientId=client)
+        touching = pybullet.getClosestPoints(body, cube, 0.0, physicsClientId=client) if cube is not None else ()
+        assert not [contact for contact in touching if task == "p2po" or contact[3] != 6]
+
+
+def test_sampled_pick_and_place_cubes_can_be_grasped_with_the_approach_within_epsilon_q():
+    obs, _ = draws("pnp", "train")
+    for cube in part(obs, "P_o"):
+        assert len(postures(cube, np.linspace(-0.3, 0.3, 61)))
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("stage", STAGES)
+def test_explicit_options_are_taken_as_they_are(make, task, stage):
+    options = far(task) | ({"partition": 2} if stage == "demo" else {})
+    env = make(task, stage=stage)
+    for seed in (0, 1):
+        obs, info = env.reset(seed=seed, options=options)
+        np.testing.assert_allclose(part(obs, "q"), start_posture(*options["start"]), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(part(obs, "P_g"), cartesian(*options["goal"]), rtol=0, atol=1e-7)
+        if task in CUBES:
+            np.testing.assert_allclose(part(obs, "P_o"), cartesian(*options["object"]), rtol=0, atol=1e-7)
+        assert info.get("partition") == options.get("partition")
+
+
+# ---- observation, reward, end ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasiums_checker_finds_nothing_to_warn_of(monkeypatch, task):
+    monkeypatch.setitem(KinovaEnv.metadata, "render_modes", ["rgb_array"])  # "human" needs a display
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for settings in ({}, {"render_mode": "rgb_array", "width": 32, "height": 24}, {"stage": "demo"}):
+            env = gymnasium.make(TASKS[task].env_id, **settings)
+            check_env(env.unwrapped)
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_observation_is_posture_sines_cosines_velocities_goal_and_goal_minus_tcp(make, arm, task):
+    env = make(task)
+    # several turns of joint 1, so that its angle has to be wrapped
+    rows = rollout(env, [TURN + 0.3 * action for action in random_actions(0, 450)], seed=0, options=far(task))
+    seen = np.array([obs for obs, *_ in rows])
+    assert seen.dtype == np.float32 and all(obs in env.observation_space for obs in seen)
+    q = part(seen, "q")
+    assert np.abs(np.diff(q[:, 0])).max() > 6, "joint 1 never passes pi"
+    assert np.all((q[:, 0] >= np.float32(-PI)) & (q[:, 0] <= np.float32(PI)))
+    np.testing.assert_allclose(part(seen, "sin q"), np.sin(q), rtol=0, atol=3e-7)
+    np.testing.assert_allclose(part(seen, "cos q"), np.cos(q), rtol=0, atol=3e-7)
+    np.testing.assert_allclose(part(seen, "e"), part(seen, "P_g") - [tcp(one) for one in q], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(part(seen, "P_g"), np.tile(cartesian(*FAR["goal"]), (len(seen), 1)), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(wrap(np.diff(q, axis=0)), part(seen, "q_dot")[1:] / 50, rtol=0, atol=1e-6)
+    assert not part(seen, "q_dot")[0].any()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_reward_is_the_sum_of_its_terms_and_each_follows_its_formula(make, task):
+    ends = set()
+    for seed, actions in ((0, random_actions(0, 150)), (1, [FOLD] * 150), (2, random_actions(2, 150))):
+        for obs, reward, terminated, _, info in rollout(make(task), actions, seed=seed, options=far(task))[1:]:
+            terms = info["reward_terms"]
+            assert list(terms) == ["distance", "effort", "reaching", "collision", "grasping"]
+            assert reward == pytest.approx(sum(terms.values()), abs=1e-12)
+            e = part(obs, "e")
+            to_go = part(obs, "P_o") - (part(obs, "P_g") - e) if task == "pnp" and not info["grasped"] else e
+            assert info["distance"] == pytest.approx(np.linalg.norm(e), abs=1e-6)
+            assert terms["distance"] == pytest.approx(-0.002 * np.linalg.norm(to_go), abs=1e-8)
+            assert terms["effort"] == pytest.approx(-0.001 * info["effort"], abs=1e-12)
+            assert terms["reaching"] == (10 if info["is_success"] else 0)
+            assert terms["collision"] == (-2 if info["collision"] else 0)
+            assert terminated == (info["is_success"] or info["collision"] != "")
+            ends.add(info["collision"])
+    assert "self" in ends
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("start", [(0.3, 0.52, 0.42), (1.0, 0.7, 0.3), (2.0, 0.4, 0.6)])
+def test_effort_of_an_arm_at_rest_is_what_gravity_asks_of_the_motors(make, arm, task, start):
+    """tau_hat = |motor torque| / limit: at rest the torque is that of the inverse dynamics under 9.81 m/s^2."""
+    body, client = arm
+    env = make(task)
+    theta = start[0]
+    options = {"goal": (theta + 3, 0.5, 0.45)} | ({"object": (theta + 2.5, 0.5, 0.45)} if task in CUBES else {})
+    obs, *_, info = rollout(env, [ZERO] * 30, seed=0, options=options | {"start": start})[-1]
+    assert np.abs(part(obs, "q_dot")).max() < 2e-3
+    torque = pybullet.calculateInverseDynamics(
+        body, part(obs, "q").tolist(), [0.0] * 4, [0.0] * 4, physicsClientId=client
+    )
+    assert info["effort"] == pytest.approx(np.linalg.norm(np.divide(torque, (39, 39, 39, 9))), abs=1e-4)
+
+
+@pytest.mark.parametrize("task", ["p2p", "p2po"])
+def test_success_is_an_error_below_five_centimetres_and_ends_the_episode_with_ten(make, task):
+    env = make(task)
+    options = far(task, start=(0.0, 0.52, 0.42), goal=(0.5, 0.52, 0.42))
+    rows = rollout(env, [-TURN] * 100, seed=0, options=options)[1:]
+    distances = [np.linalg.norm(part(obs, "e")) for obs, *_ in rows]
+    assert distances[-1] < 0.05 and min(distances[:-1]) >= 0.05
+    assert [info["is_success"] for *_, info in rows] == [False] * (len(rows) - 1) + [True]
+    obs, reward, terminated, truncated, info = rows[-1]
+    assert terminated and not truncated and info["reward_terms"]["reaching"] == 10 and 9.99 < reward < 10
+
+
+@pytest.mark.parametrize("distance", [0.0498, 0.0502])
+@pytest.mark.parametrize("task", ["p2p", "p2po"])
+def test_success_begins_at_exactly_five_centimetres(make, task, distance):
+    env = make(task)
+    options = far(task, start=(0.0, 0.52, 0.42), goal=(0.0, 0.52, 0.42 + distance))
+    *_, info = rollout(env, [ZERO], seed=0, options=options)[-1]
+    assert info["is_success"] == (info["distance"] < 0.05) == (distance < 0.05)
+
+
+def test_pick_and_place_succeeds_only_with_the_cube_grasped(make):
+    env = make("pnp")
+    start = (0.0, 0.52, 0.42)
+    *_, info = rollout(env, [ZERO], seed=0, options={"start": start, "goal": start, "object": (1.0, 0.5, 0.45)})[-1]
+    assert info["distance"] < 0.05 and not info["grasped"] and not info["is_success"]
+    obs, reward, terminated, _, info = rollout(
+        env, [ZERO], seed=0, options={"start": start, "goal": start, "object": start}
+    )[-1]
+    assert info["grasped"] and info["is_success"] and terminated and 11.99 < reward < 12
+
+
+def test_grasp_pays_two_once_and_the_cube_then_moves_with_the_tcp(make):
+    options = {"start": (0.0, 0.52, 0.42), "goal": (1.5, 0.52, 0.42), "object": (0.0, 0.54, 0.43)}
+    rows = rollout(make("pnp"), [ZERO] + [-TURN] * 30, seed=0, options=options)
+    assert not rows[0][4]["grasped"]
+    np.testing.assert_allclose(part(rows[0][0], "P_o"), cartesian(*options["object"]), rtol=0, atol=1e-7)
+    assert [info["reward_terms"]["grasping"] for *_, info in rows[1:]] == [2] + [0] * 30
+    for obs, *_, info in rows[1:]:
+        assert info["grasped"]
+        np.testing.assert_allclose(part(obs, "P_o"), part(obs, "P_g") - part(obs, "e"), rtol=0, atol=1e-6)
+    assert np.linalg.norm(part(rows[-1][0], "P_o") - part(rows[1][0], "P_o")) > 0.2
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_horizon_truncates_and_never_terminates_and_max_episode_steps_moves_it(make, task):
+    for settings, horizon in (({}, TASKS[task].horizon), ({"max_episode_steps": 7}, 7)):
+        rows = rollout(make(task, **settings), [ZERO] * 1000, seed=0, options=far(task))
+        assert len(rows) - 1 == horizon
+        assert [row[3] for row in rows] == [False] * horizon + [True]
+        assert not any(row[2] for row in rows)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("K, partition, direction", [(4, 0, 1), (4, 3, -1), (3, 1, 1), (6, 2, -1), (1, 0, 1)])
+def test_demonstration_is_truncated_where_the_tcp_leaves_its_sector(make, task, K, partition, direction):
+    env = make(task, stage="demo", partitions=K)
+    centre = (partition - (0.5 if task == "p2p" else 0)) * 2 * PI / K
+    options = {"partition": partition, "goal": (centre, 0.4, 0.55)}
+    if task in CUBES:
+        options["object"] = (centre, 0.5, 0.6)
+    options["start"] = (centre + 0.3 * direction, 0.52, 0.35)  # clear of goal and cube
+    rows = rollout(env, [-direction * TURN] * (200 if K > 1 else 350), seed=0, options=options)
+    angles = [abs(wrap(cylinder(part(obs, "P_g") - part(obs, "e"))[0] - centre)) for obs, *_ in rows]
+    assert not any(row[2] for row in rows)
+    assert all(info["partition"] == partition for *_, info in rows)
+    if K == 1:  # the sector is everything
+        assert max(angles) > PI - 0.02 and not any(row[3] for row in rows[:-1])
+        return
+    assert angles[-1] > PI / K and max(angles[:-1]) <= PI / K + 1e-6
+    assert [row[3] for row in rows] == [False] * (len(rows) - 1) + [True]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_other_stages_have_no_sector_to_leave(make, task):
+    for stage in ("train", "test"):
+        options = far(task, goal=(1.6, 0.4, 0.62)) | ({"object": (2.2, 0.5, 0.62)} if task in CUBES else {})
+        rows = rollout(make(task, stage=stage), [-TURN] * 300, seed=0, options=options)
+        assert len(rows) == 301 and not any(row[3] for row in rows)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_folding_the_hand_into_the_base_is_a_self_collision_that_terminates_with_minus_two(make, arm, task):
+    body, client = arm
+    rows = rollout(make(task), [FOLD] * 200, seed=0, options=far(task))
+    obs, reward, terminated, truncated, info = rows[-1]
+    assert info["collision"] == "self" and terminated and not truncated
+    assert info["reward_terms"]["collision"] == -2 and -2.01 < reward < -2
+    assert not any(row[4]["collision"] or row[2] for row in rows[:-1])
+    # the arm of the test's own is clear ten steps earlier, and touches at most a step's way (3 cm) beyond the last
+    gaps = []
+    for other in (rows[-11][0], obs):
+        pose(arm, part(other, "q"))
+        gaps.append(pybullet.getClosestPoints(body, body, 0.5, linkIndexA=6, linkIndexB=-1, physicsClientId=client))
+    before, after = (min(contact[8] for contact in gap) for gap in gaps)
+    assert before > 0.01 and after < 0.005
+
+
+@pytest.mark.parametrize("joints", [(0, 1, 1, 1), (0, -1, -1, -1), (0, -1, 1, -1)])
+def test_other_ways_to_fold_are_self_collisions_too(make, joints):
+    rows = rollout(make("p2po"), [np.float32(joints)] * 400, seed=0, options=far("p2po"))
+    assert rows[-1][4]["collision"] == "self"
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.465, 0.42), (0.0, 0.4, 0.42), (0.0, 0.3, 0.42), (0.0, 0.1, 0.5)])
+@pytest.mark.parametrize("task", CUBES)
+def test_cube_is_hit_by_any_link_on_p2po_and_by_any_but_the_gripper_on_pick_and_place(make, task, place):
+    options = {"start": (0.0, 0.52, 0.42), "goal": (3.0, 0.5, 0.42), "object": place}
+    _, reward, terminated, truncated, info = rollout(make(task), [ZERO], seed=0, options=options)[-1]
+    hit = task == "p2po" or place[1] < 0.35  # the gripper begins 0.371 m out
+    assert info["collision"] == ("cube" if hit else "")
+    assert terminated == hit and not truncated
+    assert info["reward_terms"]["collision"] == (-2 if hit else 0)
+
+
+def test_cube_is_four_centimetres_wide_and_fits_between_the_open_fingers(make):
+    env = make("p2po")
+    for gap, hit in ((0.001, False), (-0.001, True)):
+        # the palm ends 0.084 m from the flange, the TCP lies at 0.149 m
+        centre = 0.52 - 0.149 + 0.084 + 0.02 + gap
+        options = {"start": (0.0, 0.52, 0.42), "goal": (3.0, 0.5, 0.42), "object": (0.0, centre, 0.42)}
+        *_, info = rollout(env, [ZERO], seed=0, options=options)[-1]
+        assert (info["collision"] == "cube") == hit
+
+
+# ---- one process, many environments, many episodes -------------------------------------------------------------------
+
+
+def test_interleaved_environments_behave_as_each_does_alone_bit_for_bit(make):
+    plans = [(task, random_actions(seed, 120)) for seed, task in enumerate([*TASKS, "p2p"])]
+    plans[1] = ("p2po", [FOLD] * 120)  # one of them ends early
+    alone = [rollout(make(task), actions, seed=7, options=far(task)) for task, actions in plans]
+    envs = [make(task) for task, _ in plans]
+    together = []
+    for env, (task, _) in zip(envs, plans, strict=True):
+        obs, info = env.reset(seed=7, options=far(task))
+        together.append([(obs, 0.0, False, False, info)])
+    for t in range(120):
+        for env, (_, actions), rows in zip(envs, plans, together, strict=True):
+            if not rows[-1][2]:
+                rows.append(env.step(actions[t]))
+    for one, other in zip(alone, together, strict=True):
+        assert_same_bits(one, other)
+
+
+def test_environment_never_touches_the_default_client():
+    """A simulator opened first is PyBullet's default: its bodies, settings and clock stay as they were."""
+    script = """
+import pybullet
+client = pybullet.connect(pybullet.DIRECT)
+assert client == 0
+ball = pybullet.createMultiBody(1.0, pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=0.1), -1, [0, 0, 1])
+pybullet.resetBaseVelocity(ball, [1, 2, 3])
+def snapshot():
+    return (pybullet.getNumBodies(), pybullet.getBasePositionAndOrientation(ball), pybullet.getBaseVelocity(ball),
+            pybullet.getPhysicsEngineParameters(), pybullet.isConnected(0))
+before = snapshot()
+import gymnasium, kinova_env, numpy
+for task, row in kinova_env.TASKS.items():
+    for mode in (None, "rgb_array"):
+        env = gymnasium.make(row.env_id, render_mode=mode, width=32, height=24)
+        for seed in range(2):
+            env.reset(seed=seed)
+            for _ in range(150):
+                if env.step(numpy.float32([0.7, 1, -1, -1]))[2]:
+                    break
+        env.reset()
+        mode and env.render()
+        env.close()
+assert snapshot() == before, (snapshot(), before)
+print("same")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=Path(URDF).parents[2])
+    assert done.stdout.endswith("same\n"), done.stderr
+
+
+BEFORE = {  # what happens in the episode before, and how it ends
+    "self": ("self", [FOLD] * 200, {}),
+    "timeout": ("", random_actions(5, 150), {}),
+    "cube": ("cube", [-TURN] * 200, {"object": (1.0, 0.5, 0.42)}),
+    "grasp": ("", [ZERO] + [-TURN] * 20, {"object": (0.3, 0.52, 0.42)}),
+}
+
+
+@pytest.mark.parametrize(
+    "task, before",
+    [(task, before) for task in TASKS for before in BEFORE if before not in ("cube", "grasp")]
+    + [("p2po", "cube"), ("pnp", "grasp")],
+)
+def test_episode_does_not_depend_on_the_one_before_it_bit_for_bit(make, task, before):
+    collision, actions, options = BEFORE[before]
+    for after in (random_actions(6, 150), [FOLD] * 150):
+        fresh = rollout(make(task), after, seed=11)
+        env = make(task)
+        end = rollout(env, actions, seed=0, options=far(task, **options))[-1][4]
+        assert end["collision"] == collision and end["grasped"] == (before == "grasp")
+        assert_same_bits(rollout(env, after, seed=11), fresh)
+        assert_same_bits(rollout(env, after, seed=11), fresh)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("task", TASKS)
+def test_same_seed_is_the_same_run_of_episodes_and_another_seed_another(make, task, stage):
+    def three(seed):
+        env = make(task, stage=stage)
+        return [row for n in range(3) for row in rollout(env, random_actions(n, 30), seed=seed if n == 0 else None)]
+
+    first = three(4)
+    assert_same_bits(first, three(4))
+    assert first[0][0].tobytes() != three(5)[0][0].tobytes()
+
+
+# ---- pictures, import ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_rgb_array_has_the_size_asked_and_shows_an_arm_that_moves_and_the_goal(make, task):
+    env = make(task, render_mode="rgb_array", width=96, height=64)
+    env.reset(seed=0, options=far(task))
+    first = env.render()
+    assert first.shape == (64, 96, 3) and first.dtype == np.uint8
+    assert first.max() > 200 and first.min() < 80  # white links, dark joints
+
+    def differs(**options):
+        env.reset(seed=0, options=far(task, **options))
+        return np.any(np.abs(env.render().astype(int) - first) > 20, axis=-1).mean()
+
+    assert differs() == 0
+    assert differs(start=(2.5, 0.52, 0.42)) > 0.03
+    assert differs(goal=(-1.0, 0.5, 0.4)) > 0.002
+    if task in CUBES:
+        assert differs(object=(-0.5, 0.5, 0.45)) > 0.0005
+
+
+def test_environment_without_a_render_mode_draws_nothing_and_moves_alike(make):
+    assert make("p2p").unwrapped.render() is None
+    plain, drawn = (
+        rollout(make("p2p", render_mode=mode), random_actions(0, 50), options=far("p2p"))
+        for mode in (None, "rgb_array")
+    )
+    assert_same_bits(plain, drawn)
+
+
+def test_importing_starts_no_simulator():
+    script = """
+import kinova_env, gas, pid_demo, pybullet
+assert not any(pybullet.isConnected(client) for client in range(10))
+env = kinova_env.KinovaEnv()
+assert pybullet.isConnected(0)
+env.close()
+assert not pybullet.isConnected(0)
+print("none")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=Path(URDF).parents[2])
+    assert done.stdout.endswith("none\n"), done.stderr

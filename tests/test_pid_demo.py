@@ -1,0 +1,559 @@
+"""pid_demo.py: the controller, the recorded arrays, the demonstration file, the command line."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from PIL import Image
+
+import gas
+import pid_demo
+from kinova_env import OBSERVATION, TASKS, cartesian, postures, tcp, wrap
+from pid_demo import GAINS, PID, film, load_demos, record
+
+PI = math.pi
+STEP = 0.02  # s
+ROWS = {"obs": "f4", "act": "f4", "rew": "f8", "obs2": "f4", "terminated": "?", "truncated": "?", "episode": "i8"}
+EPISODES = {"partition": "i8", "success": "?", "length": "i8", "return": "f8"}
+STILL = (0.0, 0.0, 0.0)  # gains of a controller that never moves: every episode fails
+
+
+@pytest.fixture
+def make():
+    """gymnasium.make by the task's short name; closed at the end of the test."""
+    opened = []
+
+    def make_(task="p2p", **settings):
+        opened.append(gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **settings))
+        return opened[-1]
+
+    yield make_
+    for env in opened:
+        env.close()
+
+
+def set_point(env, gain=0.1):
+    """Joint set point of a P controller from its action: q + a / K_P, the gain small enough never to saturate."""
+    return env.unwrapped.q + PID(env, (gain, 0.0, 0.0)).act().astype(float) / gain
+
+
+# ---- the controller --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", ["train", "demo", "test"])
+def test_set_point_is_the_posture_nearest_to_the_present_one_that_puts_the_tcp_at_the_goal(make, stage):
+    env = make(stage=stage)
+    for seed in range(20):
+        env.reset(seed=seed)
+        q, goal = np.array(env.unwrapped.q), env.unwrapped.goal
+        target = set_point(env)
+        assert math.dist(tcp(target), goal) < 1e-5
+        ways = postures(goal) - q
+        ways[:, 0] = wrap(ways[:, 0])
+        assert np.linalg.norm(target - q) == pytest.approx(np.linalg.norm(ways, axis=1).min(), abs=1e-5)
+
+
+@pytest.mark.parametrize("start, goal", [(3.0, -3.0), (-3.0, 3.0), (0.5, 0.8), (-1.5, 1.5), (-2.0, 2.0)])
+def test_joint_1_turns_the_shortest_way_round(make, start, goal):
+    env = make()
+    env.reset(seed=0, options={"start": (start, 0.52, 0.42), "goal": (goal, 0.52, 0.42)})
+    way = set_point(env)[0] - env.unwrapped.q[0]
+    assert abs(way) < PI
+    assert way == pytest.approx(-wrap(goal - start), abs=1e-3)  # the axis points down
+
+
+def test_action_is_proportional_integral_and_derivative_terms_of_the_joint_error(make):
+    env = make()
+    env.reset(seed=0, options={"start": (0.3, 0.52, 0.42), "goal": (0.7, 0.55, 0.46)})
+    q = np.array(env.unwrapped.q)
+    q_tilde = set_point(env) - q
+    for K_P, K_D, K_I in ((0.4, 0.2, 0.0), (1.0, 0.2, 0.3), (0.0, 0.5, 0.0), (0.5, 0.0, 1.5)):
+        pid, integral = PID(env, (K_P, K_D, K_I)), np.zeros(4)
+        for shift, q_dot in ((0.0, (0.0,) * 4), (0.05, (0.5, -0.4, 0.3, 0.2)), (-0.1, (-0.1, 0.2, 0.0, 0.6))):
+            env.unwrapped.q, env.unwrapped.q_dot = tuple(q + shift), q_dot
+            integral += (q_tilde - shift) * STEP
+            expected = K_P * (q_tilde - shift) + K_I * integral - K_D * np.array(q_dot)
+            assert np.abs(expected).max() < 1
+            np.testing.assert_allclose(pid.act(), expected, rtol=0, atol=2e-6)
+
+
+def test_named_gains_are_designs_and_an_unknown_name_is_an_error(make):
+    assert GAINS["authors"] == (0.4, 0.2, 0.0)
+    assert GAINS["fast"][0] > GAINS["authors"][0]
+    env = make()
+    env.reset(seed=0)
+    for name, gains in GAINS.items():
+        assert np.array_equal(PID(env, name).act(), PID(env, gains).act())
+    assert np.array_equal(PID(env).act(), PID(env, "authors").act())
+    with pytest.raises(KeyError):
+        PID(env, "quick")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_action_is_four_float32_within_one_whatever_the_gains(make, task):
+    env = make(task)
+    saturated = 0
+    for gains in ((0.4, 0.2, 0.0), (1e6, 0.0, 0.0), (100.0, 10.0, 100.0)):
+        pid = PID(env, gains)
+        env.reset(seed=1)
+        for _ in range(30):
+            action = pid.act()
+            assert action.dtype == np.float32 and action.shape == (4,) and action in env.action_space
+            saturated += np.abs(action).max() == 1
+            if env.step(action)[2]:
+                break
+    assert saturated > 10
+
+
+def test_integral_grows_with_the_error_and_rests_while_the_action_is_saturated(make):
+    env = make()
+    env.reset(seed=0, options={"start": (0.0, 0.52, 0.42), "goal": (-1.0, 0.52, 0.42)})
+    pid = PID(env, (0.4, 0.0, 5.0))
+    first, second = pid.act()[0], pid.act()[0]
+    assert second - first == pytest.approx(5.0 * 1.0 * STEP, abs=1e-3)  # K_I times the error of 1 rad times 20 ms
+    for _ in range(500):  # 10 s in saturation; a wound-up integral would ask for 50 now
+        assert pid.act()[0] <= 1
+    assert pid.act()[0] == 1
+    env.unwrapped.q = tuple(set_point(env) - (0.05, 0, 0, 0))
+    assert 0.3 < pid.act()[0] < 0.9
+    env.unwrapped.q = tuple(set_point(env) + (1.0, 0, 0, 0))
+    assert pid.act()[0] < 0.3  # it turns round at once
+
+
+def test_saturation_of_one_joint_does_not_stop_the_integral_of_another(make):
+    env = make()
+    env.reset(seed=0, options={"start": (0.0, 0.52, 0.42), "goal": (-1.5, 0.55, 0.42)})
+    pid = PID(env, (1.0, 0.0, 1.0))
+    actions = np.array([pid.act() for _ in range(10)])
+    assert np.all(actions[:, 0] == 1)
+    assert np.all(np.abs(actions[:, 1]) < 1)
+    assert np.ptp(np.diff(actions[:, 1])) < 1e-6 and abs(actions[-1, 1] - actions[0, 1]) > 1e-3
+
+
+def test_new_episode_has_its_own_set_point_and_an_empty_integral(make):
+    env = make()
+    pid = PID(env, (0.4, 0.1, 1.0))
+    env.reset(seed=0, options={"goal": (-1.0, 0.5, 0.45)})
+    for _ in range(50):
+        env.step(pid.act())
+    env.reset(seed=0, options={"goal": (1.6, 0.5, 0.45)})
+    fresh = PID(env, (0.4, 0.1, 1.0))
+    for _ in range(20):
+        action = fresh.act()
+        assert np.array_equal(pid.act(), action)
+        env.step(action)
+
+
+def test_wrapper_and_environment_are_controlled_alike(make):
+    env = make()
+    env.reset(seed=0)
+    assert env.unwrapped is not env
+    assert np.array_equal(PID(env).act(), PID(env.unwrapped).act())
+
+
+def test_fast_gains_succeed_in_at_least_95_percent_and_in_fewer_steps_than_the_authors():
+    fast, _ = record("p2p", 20, gains="fast", seed=0)
+    authors, _ = record("p2p", 20, gains="authors", seed=0)
+    assert fast["success"].mean() >= 0.95
+    assert authors["success"].mean() >= 0.5
+    both = fast["success"] & authors["success"]
+    assert np.all(fast["length"][both] < authors["length"][both])
+    assert fast["length"].mean() < 0.6 * authors["length"].mean()
+
+
+# ---- the recorded arrays ---------------------------------------------------------------------------------------------
+
+
+def check_arrays(demos, task, episodes):
+    """What holds of every set of demonstrations: columns, types, shapes, and that the rows fit together."""
+    rows, width = len(demos["rew"]), sum(width for _, width, _ in OBSERVATION[task])
+    assert set(ROWS) | set(EPISODES) <= set(demos)
+    for name, dtype in (ROWS | EPISODES).items():
+        columns = {"obs": (width,), "obs2": (width,), "act": (4,)}.get(name, ())
+        assert demos[name].dtype == np.dtype(dtype), name
+        assert demos[name].shape == (rows if name in ROWS else episodes, *columns), name
+        assert np.all(np.isfinite(demos[name]))
+    assert rows == demos["length"].sum() and np.all(demos["length"] > 0)
+    assert np.array_equal(demos["episode"], np.repeat(np.arange(episodes), demos["length"]))
+    assert np.abs(demos["act"]).max() <= 1
+    end = np.cumsum(demos["length"]) - 1
+    ended = demos["terminated"] | demos["truncated"]
+    assert np.array_equal(np.flatnonzero(ended), end)
+    inside = np.flatnonzero(~ended)
+    assert np.array_equal(demos["obs2"][inside], demos["obs"][inside + 1])
+    for last in end[:-1]:  # the next episode begins elsewhere
+        assert not np.array_equal(demos["obs2"][last], demos["obs"][last + 1])
+    for n in range(episodes):
+        assert demos["return"][n] == pytest.approx(demos["rew"][demos["episode"] == n].sum(), abs=1e-9)
+    assert np.array_equal(demos["success"], demos["terminated"][end] & (demos["rew"][end] > 5))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_record_gives_whole_episodes_whose_rows_returns_and_ends_fit_together(task):
+    demos, steps = record(task, 3, gains="fast", seed=2)
+    check_arrays(demos, task, 3)
+    assert steps == len(demos["rew"])
+
+
+def test_recorded_rows_are_what_the_environment_returned(make):
+    demos, _ = record("p2p", 2, gains="fast", seed=5)
+    env = make(stage="demo")
+    env.reset(seed=5)
+    row = 0
+    for n in range(2):
+        s, info = env.reset()
+        assert demos["partition"][n] == info["partition"]
+        for _ in range(demos["length"][n]):
+            s2, reward, terminated, truncated, _ = env.step(demos["act"][row])
+            assert np.array_equal(demos["obs"][row], s) and np.array_equal(demos["obs2"][row], s2)
+            assert (demos["rew"][row], demos["terminated"][row], demos["truncated"][row]) == (
+                reward, terminated, truncated
+            )  # fmt: skip
+            s, row = s2, row + 1
+    assert row == len(demos["rew"])
+
+
+def test_recorded_actions_are_the_controllers():
+    for gains in ("authors", "fast"):
+        demos, _ = record("p2p", 1, gains=gains, seed=5)
+        K_P, K_D, _ = GAINS[gains]
+        goal = demos["obs"][0, 16:19].astype(float)
+        first = demos["obs"][0, :4].astype(float)
+        ways = postures(goal) - first
+        ways[:, 0] = wrap(ways[:, 0])
+        q_sp = first + ways[np.argmin(np.linalg.norm(ways, axis=1))]
+        q_tilde = q_sp - demos["obs"][:, :4]
+        q_tilde[:, 0] = wrap(q_tilde[:, 0])
+        np.testing.assert_allclose(
+            demos["act"], np.clip(K_P * q_tilde - K_D * demos["obs"][:, 12:16], -1, 1), rtol=0, atol=2e-6
+        )
+
+
+def test_failed_episodes_are_kept_and_flagged():
+    demos, steps = record("p2p", 3, gains=STILL, seed=0)
+    check_arrays(demos, "p2p", 3)
+    assert not demos["success"].any() and not demos["terminated"].any()
+    assert demos["length"].tolist() == [400] * 3 and steps == 1200
+    assert demos["truncated"].sum() == 3
+
+
+def test_same_seed_records_the_same_demonstrations_and_another_seed_others():
+    first, again, other = (record("p2p", 2, gains="fast", seed=seed)[0] for seed in (3, 3, 4))
+    for name, column in first.items():
+        assert column.tobytes() == again[name].tobytes()
+    assert first["obs"].tobytes() != other["obs"].tobytes()
+
+
+def test_partitions_are_drawn_from_all_K_and_each_episode_begins_in_its_own():
+    for K in (3, 4):
+        demos, _ = record("p2p", 16, gains="fast", seed=0, partitions=K)
+        assert set(demos["partition"]) == set(range(K))
+        begin = np.cumsum(demos["length"]) - demos["length"]
+        assert np.array_equal(gas.partition_of(demos["obs"][begin], K), demos["partition"])
+
+
+@pytest.mark.parametrize("task", ["p2p", "p2po"])
+@pytest.mark.parametrize("N, K", [(5, 4), (4, 4), (7, 3), (1, 8)])
+def test_gas_takes_N_over_K_real_episodes_rounded_up_in_partition_0_and_maps_them_to_N(task, N, K):
+    demos, steps = record(task, N, gains="fast", seed=0, partitions=K, symmetry="gas")
+    check_arrays(demos, task, N)
+    assert demos["partition"].tolist() == [n % K for n in range(N)]
+    assert steps == demos["length"][::K].sum()  # the real ones
+    assert len(demos["length"][::K]) == -(-N // K)
+    begin = np.cumsum(demos["length"]) - demos["length"]
+    assert np.array_equal(gas.partition_of(demos["obs"][begin], K), demos["partition"])
+    for n in range(N):
+        real = demos["episode"] == n - n % K
+        mine = demos["episode"] == n
+        assert np.array_equal(demos["obs"][mine], gas.phi(demos["obs"][real], n % K, K))
+        assert np.array_equal(demos["rew"][mine], demos["rew"][real])
+
+
+@pytest.mark.parametrize("stage", ["train", "test"])
+def test_other_stages_are_recorded_in_partition_0_from_their_own_start(stage):
+    demos, _ = record("p2p", 2, gains="fast", seed=0, stage=stage)
+    check_arrays(demos, "p2p", 2)
+    assert demos["partition"].tolist() == [0, 0]
+    start = demos["obs"][0, 16:19] - demos["obs"][0, 19:22]
+    theta, rho, z = {"train": (PI / 4, 0.52, 0.42), "test": (-PI / 4, 0.5, 0.45)}[stage]
+    np.testing.assert_allclose(start, cartesian(theta, rho, z), rtol=0, atol=1e-6)
+
+
+# ---- the demonstration file ------------------------------------------------------------------------------------------
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["pid_demo.py", *map(str, arguments)])
+    return pid_demo.main()
+
+
+@pytest.mark.parametrize("symmetry, K", [("none", 4), ("gas", 3)])
+def test_recorded_file_read_back_is_what_record_gives_and_says_how_it_was_made(monkeypatch, tmp_path, symmetry, K):
+    out = tmp_path / "demos.npz"
+    arguments = ("--record", 4, "--out", out, "--gains", "fast", "--K_D", 0.25, "--seed", 6, "--partitions", K)
+    run(monkeypatch, *arguments, "--symmetry", symmetry)
+    assert list(tmp_path.iterdir()) == [out]  # nothing half-written stays
+    demos, meta = load_demos(out, "p2p")
+    expected, steps = record("p2p", 4, (1.0, 0.25, 0.0), seed=6, partitions=K, symmetry=symmetry)
+    assert set(demos) == set(expected)
+    for name, column in expected.items():
+        assert demos[name].dtype == column.dtype and demos[name].tobytes() == column.tobytes()
+    assert meta["task"] == "p2p" and meta["stage"] == "demo" and meta["env_steps"] == steps
+    assert (meta["gains"], meta["seed"], meta["partitions"], meta["symmetry"]) == ([1.0, 0.25, 0.0], 6, K, symmetry)
+    with np.load(out, allow_pickle=False) as file:
+        assert set(file.files) == set(expected) | {"meta"}
+        assert json.loads(str(file["meta"])) == meta
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_file_of_each_task_is_written_and_read_as_that_task_and_no_other(monkeypatch, tmp_path, task):
+    out = tmp_path / "demos.npz"
+    run(monkeypatch, "--task", task, "--record", 1, "--out", out, "--gains", "fast")
+    demos, meta = load_demos(out, task)
+    check_arrays(demos, task, 1)
+    for other in set(TASKS) - {task}:
+        with pytest.raises(ValueError, match=rf"{out}.*{task}, not {other}"):
+            load_demos(out, other)
+
+
+def test_record_replaces_an_older_file(monkeypatch, tmp_path):
+    out = tmp_path / "demos.npz"
+    out.write_text("an older one")
+    run(monkeypatch, "--record", 1, "--out", out, "--gains", "fast")
+    assert len(load_demos(out, "p2p")[0]["length"]) == 1
+
+
+@pytest.fixture(scope="module")
+def good():
+    demos, _ = record("p2p", 2, gains="fast", seed=0)
+    return demos | {"meta": np.array(json.dumps({"task": "p2p"}))}
+
+
+def save(path, columns):
+    with open(path, "wb") as file:
+        np.savez_compressed(file, **columns)
+
+
+def damaged(path, at):
+    """Some bytes of the file changed."""
+    content = bytearray(path.read_bytes())
+    for i in range(3):
+        content[at + i] ^= 0x55
+    path.write_bytes(bytes(content))
+
+
+def first_not_finite(column):
+    column = column.copy()
+    column.flat[0] = np.nan
+    return column
+
+
+BROKEN = {  # how a good file is spoilt
+    "no file": lambda path, good: path.unlink(),
+    "folder": lambda path, good: (path.unlink(), path.mkdir()),
+    "empty": lambda path, good: path.write_bytes(b""),
+    "text": lambda path, good: path.write_text("episode,return\n1,2\n"),
+    "one array": lambda path, good: np.save(open(path, "wb"), good["obs"]),  # noqa: SIM115
+    "first half": lambda path, good: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "last byte lost": lambda path, good: path.write_bytes(path.read_bytes()[:-1]),
+    "damaged early": lambda path, good: damaged(path, 60),
+    "damaged in the middle": lambda path, good: damaged(path, path.stat().st_size // 2),
+    "damaged directory": lambda path, good: damaged(path, path.stat().st_size - 30),
+    **{
+        f"no {name}": lambda path, good, name=name: save(path, {key: good[key] for key in good if key != name})
+        for name in (*ROWS, *EPISODES, "meta")
+    },
+    **{
+        f"pickled {name}": lambda path, good, name=name: save(path, good | {name: good[name].astype(object)})
+        for name in ("obs", "act", "partition", "meta")
+    },
+    **{
+        f"{name} too short": lambda path, good, name=name: save(path, good | {name: good[name][:-1]})
+        for name in (*ROWS, *EPISODES)
+    },
+    **{
+        f"{name} not finite": lambda path, good, name=name: save(path, good | {name: first_not_finite(good[name])})
+        for name in ("obs", "act", "rew", "obs2")
+    },
+    **{
+        f"{name} too narrow": lambda path, good, name=name: save(path, good | {name: good[name][:, :-1]})
+        for name in ("obs", "act", "obs2")
+    },
+    "obs a number": lambda path, good: save(path, good | {"obs": np.array(3.0)}),
+    "obs words": lambda path, good: save(path, good | {"obs": good["obs"].astype(str)}),
+    "meta not JSON": lambda path, good: save(path, good | {"meta": np.array("{")}),
+    "meta without a task": lambda path, good: save(path, good | {"meta": np.array("{}")}),
+    "meta a list": lambda path, good: save(path, good | {"meta": np.array('["p2p"]')}),
+    "meta a number": lambda path, good: save(path, good | {"meta": np.array("3")}),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_file_that_is_not_whole_demonstrations_is_a_value_error_that_names_it(tmp_path, good, how):
+    path = tmp_path / "demos.npz"
+    save(path, good)
+    assert set(load_demos(path, "p2p")[0]) == set(good) - {"meta"}
+    BROKEN[how](path, good)
+    with pytest.raises(ValueError) as error:
+        load_demos(path, "p2p")
+    assert str(path) in str(error.value)
+
+
+def test_pickled_file_is_never_unpickled(tmp_path, good):
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "sprung",))
+
+    path = tmp_path / "demos.npz"
+    save(path, good | {"obs": np.array([Trap()], dtype=object)})
+    with pytest.raises(ValueError, match="demos.npz"):
+        load_demos(path, "p2p")
+    assert not (tmp_path / "sprung").exists()
+
+
+# ---- the command line ------------------------------------------------------------------------------------------------
+
+BAD = [  # arguments ({} is an empty folder), what the line names
+    ("", "--record --trials --watch --gif"),
+    ("--task reach --trials 1", "reach"),
+    ("--trials 0", "--trials 0"),
+    ("--trials -3", "--trials -3"),
+    ("--trials 1.5", "1.5"),
+    ("--trials many", "many"),
+    ("--trials 1 --record 1 --out {}/x.npz", "--record"),
+    ("--trials 1 --gif {}/x.gif", "--gif"),
+    ("--record 0 --out {}/x.npz", "--record 0"),
+    ("--record 1", "--out"),
+    ("--trials 1 --out {}/x.npz", "--out"),
+    ("--record 1 --out {}/none/x.npz", "none/x.npz"),
+    ("--record 1 --out {}", "--out"),
+    ("--gif {}/none/x.gif", "none/x.gif"),
+    ("--gif {}", "--gif"),
+    ("--trials 1 --gains quick", "quick"),
+    ("--trials 1 --K_P -1", "K_P"),
+    ("--trials 1 --K_D nan", "K_D"),
+    ("--trials 1 --K_I inf", "K_I"),
+    ("--trials 1 --stage practice", "practice"),
+    ("--trials 1 --symmetry so2", "so2"),
+    ("--trials 1 --symmetry gas --stage test", "--stage"),
+    ("--trials 1 --partitions 0", "--partitions 0"),
+    ("--trials 1 --seed -1", "--seed -1"),
+    ("--trials 1 --speed 2", "--speed"),
+    ("--watch", "DISPLAY"),
+]
+
+
+@pytest.mark.parametrize("line, named", BAD)
+def test_bad_input_is_one_line_on_standard_error_exit_code_2_and_nothing_written(
+    monkeypatch, tmp_path, capsys, line, named
+):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr(pid_demo, "film", lambda *a, **k: pytest.fail("filmed"))
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, *line.format(folder).split())
+    out, err = capsys.readouterr()
+    assert stopped.value.code == 2
+    assert out == "" and err.count("\n") == 1 and named in err
+    assert list(tmp_path.rglob("*")) == [folder]
+
+
+def test_empty_file_name_is_bad_input_too(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    for arguments in (("--record", 1, "--out", ""), ("--gif", "")):
+        with pytest.raises(SystemExit) as stopped:
+            run(monkeypatch, *arguments)
+        assert stopped.value.code == 2 and capsys.readouterr().err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_trials_print_success_length_return_and_effort_and_write_nothing(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    run(monkeypatch, "--trials", 3, "--gains", "fast", "--stage", "demo", "--seed", 2)
+    out = capsys.readouterr().out
+    demos, steps = record("p2p", 3, "fast", seed=2)
+    assert "3 episodes" in out and f"{steps} environment steps" in out
+    assert f"success {100 * demos['success'].mean():.1f} %" in out
+    assert f"{demos['length'][demos['success']].mean():.0f} steps" in out
+    assert f"return {demos['return'].mean():.2f}" in out
+    effort = float(out.split("effort ")[1].split("%")[0])
+    assert 0 < effort < 100  # T_eff: 100 times the mean norm of tau_hat, over its largest possible value of 2
+    terms = demos["rew"][demos["rew"] < 5] + 2e-3 * np.linalg.norm(demos["obs2"][demos["rew"] < 5, 19:22], axis=1)
+    assert effort == pytest.approx(-terms.mean() / 1e-3 * 50, rel=0.1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_trials_without_a_success_say_so(monkeypatch, capsys):
+    run(monkeypatch, "--trials", 1, "--K_P", 0)
+    out = capsys.readouterr().out
+    assert "success 0.0 %" in out and "nan" not in out
+
+
+def test_command_line_records_and_exits_0_and_says_what_is_wrong_with_2(tmp_path):
+    """The same through a real process: no traceback, and PyBullet's greeting is all else on standard error."""
+    script = Path(pid_demo.__file__)
+    out = tmp_path / "demos.npz"
+    arguments = [sys.executable, script, "--record", "1", "--out", out, "--gains", "fast"]
+    done = subprocess.run(arguments, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert str(out) in done.stdout and len(load_demos(out, "p2p")[0]["length"]) == 1
+    done = subprocess.run([*arguments, "--K_P", "nan"], capture_output=True, text=True, cwd=tmp_path)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("pybullet build time")]
+    assert done.returncode == 2 and done.stdout == ""
+    assert len(lines) == 1 and "--K_P" in lines[0]
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def test_film_is_a_gif_of_the_episodes_in_real_time_with_frames_that_differ(make, tmp_path):
+    env = make(render_mode="rgb_array", width=48, height=36, max_episode_steps=8)
+    path = tmp_path / "arm.gif"
+    seen = []
+
+    def act(obs):
+        seen.append(obs)
+        return np.array([1, 0, 0, 0], dtype=np.float32)
+
+    film(env, act, path, episodes=2, seed=3, every=4)
+    assert list(tmp_path.iterdir()) == [path]
+    assert len(seen) == 16
+    np.testing.assert_array_equal(seen[0], env.reset(seed=3)[0])
+    np.testing.assert_array_equal(seen[8], env.reset(seed=4)[0])
+    with Image.open(path) as image:
+        assert image.format == "GIF" and image.size == (48, 36) and image.n_frames > 3
+        durations, frames = [], set()
+        for n in range(image.n_frames):
+            image.seek(n)
+            durations.append(image.info["duration"])
+            frames.add(image.convert("RGB").tobytes())
+    assert len(frames) > 3
+    # a frame every 4 steps of 20 ms, and a rest of ten frames after each episode
+    assert sum(durations) == 2 * (2 + 10) * 80 and durations[0] == 80
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gif_option_films_the_pid_on_the_task_asked(monkeypatch, tmp_path, capsys, task):
+    path = tmp_path / "arm.gif"
+    whole = pid_demo.film
+    make = gymnasium.make
+    made = []
+
+    def short_make(id_, **settings):  # twelve small frames instead of hundreds
+        made.append((id_, settings["render_mode"], settings["stage"]))
+        return make(id_, **(settings | {"width": 32, "height": 24, "max_episode_steps": 5}))
+
+    monkeypatch.setattr(gymnasium, "make", short_make)
+    monkeypatch.setattr(pid_demo, "film", lambda *a, **k: whole(*a, **(k | {"episodes": 1})))
+    run(monkeypatch, "--task", task, "--gif", path, "--gains", "fast", "--stage", "train")
+    assert made == [(TASKS[task].env_id, "rgb_array", "train")]
+    assert str(path) in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [path]
+    with Image.open(path) as image:
+        assert image.n_frames > 1
