@@ -73,6 +73,7 @@ class Flags:
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
+    pretanh_penalty: float | None = flag(None, "times the mean u^2, a = tanh(u), in L_A; robust 1e-3", low=0)
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -92,8 +93,10 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
+                  pretanh_penalty=0.0),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
+                   pretanh_penalty=1e-3),
 }
 QUICK = dict(recipe="robust", epochs=15)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
@@ -346,7 +349,8 @@ class Learner:
             L_BC = loss_BC(a_demo, a_hat, M)
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
-        (L_C + L_A).backward()
+        penalty = f.pretanh_penalty * (u[:n] ** 2).mean() if f.pretanh_penalty else 0.0
+        (L_C + L_A + penalty).backward()
         self.optimizer.step()
         with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
             self.target.flat.lerp_(self.net.flat, 1 - f.polyak)

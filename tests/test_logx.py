@@ -1,9 +1,11 @@
 """logx.py: flags from a dataclass, files that are always whole, a run's folder, and safe loading."""
 
+import io
 import json
 import math
 import os
 import pickle
+import random
 import re
 import subprocess
 from dataclasses import dataclass
@@ -170,8 +172,6 @@ class Object:
 
 def unloadable():
     """{what: bytes of a file that load_torch must refuse}."""
-    import io
-
     whole = io.BytesIO()
     torch.save({"w": torch.arange(1000.0), "n": 3}, whole)
     whole = whole.getvalue()
@@ -192,6 +192,7 @@ def unloadable():
     }
 
 
+@pytest.mark.filterwarnings("error")  # a warning is a second line on standard error
 @pytest.mark.parametrize("what", unloadable())
 def test_load_torch_refuses_with_a_line_that_names_the_file(tmp_path, what):
     path = tmp_path / "file.pt"
@@ -199,6 +200,16 @@ def test_load_torch_refuses_with_a_line_that_names_the_file(tmp_path, what):
     with pytest.raises(ValueError) as refused:
         logx.load_torch(path)
     assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_load_torch_refuses_any_text_and_any_bytes(tmp_path):
+    draw = random.Random(0)
+    for alphabet in (b"abcdefghijklmnopqrstuvwxyz0123456789 ,.-()[]{}\n", bytes(range(256))):
+        for _ in range(100):
+            (tmp_path / "file.pt").write_bytes(bytes(draw.choices(alphabet, k=draw.randint(1, 100))))
+            with pytest.raises(ValueError, match="file.pt"):
+                logx.load_torch(tmp_path / "file.pt")
 
 
 def test_load_torch_says_when_there_is_no_file_and_when_it_is_a_folder(tmp_path):
