@@ -74,6 +74,7 @@ class Flags:
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
     pretanh_penalty: float | None = flag(None, "times the mean u^2, a = tanh(u), in L_A; robust 1e-3", low=0)
+    mask_after: int | None = flag(None, "steps before which M_t = 1, whatever the critic thinks; paper 0", low=0)
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -94,9 +95,9 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P
 }
 BY_RECIPE = {
     "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  pretanh_penalty=0.0),
+                  pretanh_penalty=0.0, mask_after=0),
     "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   pretanh_penalty=1e-3),
+                   pretanh_penalty=1e-3, mask_after=20_000),
 }
 QUICK = dict(recipe="robust", epochs=15)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
@@ -306,7 +307,7 @@ class Learner:
         self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
 
-    def block(self, B_o, B_d):
+    def block(self, B_o, B_d, masked=True):
         """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name."""
         f = self.flags
         n = f.update_every
@@ -317,15 +318,15 @@ class Learner:
         rows = rows.to(f.device)
         batches = [(o, d) for o, d in zip(rows, rows_demo.to(f.device) if B_d else [None] * n, strict=True)]
         for rows, rows_demo in batches[:-1]:
-            self.update(rows, rows_demo)
-        measured = self.update(*batches[-1], measure=True)
+            self.update(rows, rows_demo, masked)
+        measured = self.update(*batches[-1], masked, measure=True)
         if self.actor is not self.net.u:
             with torch.no_grad():
                 for p, q in zip(self.actor.parameters(), self.net.u.parameters(), strict=True):
                     p.copy_(q)
         return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
 
-    def update(self, rows, rows_demo, measure=False):
+    def update(self, rows, rows_demo, masked=True, measure=False):
         """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). measure: returns tensors."""
         f = self.flags
         s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
@@ -346,7 +347,7 @@ class Learner:
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
             M = mask(Q_demo, Q_own)
-            L_BC = loss_BC(a_demo, a_hat, M)
+            L_BC = loss_BC(a_demo, a_hat, M if masked else torch.ones_like(M))
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
         penalty = f.pretanh_penalty * (u[:n] ** 2).mean() if f.pretanh_penalty else 0.0
@@ -415,13 +416,19 @@ def demonstrations(flags):
     if found < flags.num_demos:
         logx.fail(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     first = demos["episode"] < flags.num_demos
-    return {name: rows[first] for name, rows in demos.items() if len(rows) == len(first)}, meta["env_steps"]
+    return {name: demos[name][first] for name in ("obs", "act", "rew", "obs2", "terminated")}, meta["env_steps"]
 
 
 def train(flags, variant=""):
     """Runs ag:d-ease-off to the end, or on from the checkpoint. Returns the run's folder."""
     config = asdict(flags) | {"algo": "ddpg", "variant": variant}
-    run = logx.Run(Path(flags.data_dir) / flags.name, config, flags.resume, flags.tensorboard)
+    folder = Path(flags.data_dir) / flags.name
+    if logx.is_new(folder, flags.resume):  # before the folder is made: there is nothing to undo if --demos is no good
+        demos, demo_env_steps = demonstrations(flags)
+        if demos and len(demos["rew"]) > flags.replay_size:
+            n = len(demos["rew"])
+            logx.fail(f"--replay_size {flags.replay_size}: holds less than the {n} demonstrated steps")
+    run = logx.Run(folder, config, flags.tensorboard)
     torch.manual_seed(flags.seed)
     rng = np.random.default_rng(flags.seed)  # exploration
     make = dict(max_episode_steps=flags.max_ep_len, disable_env_checker=True)
@@ -455,12 +462,8 @@ def train(flags, variant=""):
         for a in actions:
             s, *_ = env.step(a)
     else:
-        demos, demo_env_steps = demonstrations(flags)
         if demos:
-            rows = len(demos["rew"])
-            if rows > flags.replay_size:
-                logx.fail(f"--replay_size {flags.replay_size}: holds less than the {rows} demonstrated steps")
-            B_d = ReplayBuffer(obs_dim, rows)
+            B_d = ReplayBuffer(obs_dim, len(demos["rew"]))
             columns = ("obs", "act", "rew", "obs2", "terminated")
             for s, a, r, s2, terminated in zip(*(demos[name] for name in columns), strict=True):
                 transition = (view(s), a, r, view(s2), terminated)
@@ -531,8 +534,8 @@ def train(flags, variant=""):
 
         # update
         if t >= flags.update_after and t % flags.update_every == 0:
-            measured = learner.block(B_o, B_d)
-            loop["epoch_log"].append(list(measured.values()))
+            measured = learner.block(B_o, B_d, masked=t > flags.mask_after)
+            loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
                 logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))
                 print(f"{run.folder}: NaN in a loss at step {t}; networks saved to nan.pt", file=sys.stderr)
@@ -546,12 +549,12 @@ def train(flags, variant=""):
             if loop["epoch_episodes"]:
                 row |= zip(("EpRet", "EpLen", "Success"), np.mean(loop["epoch_episodes"], axis=0).tolist(), strict=True)
             if loop["epoch_log"]:
-                row |= zip(measured, np.mean(loop["epoch_log"], axis=0).tolist(), strict=True)
+                row |= {key: float(np.mean([m[key] for m in loop["epoch_log"]])) for key in loop["epoch_log"][0]}
             if flags.eval_every and (epoch % flags.eval_every == 0 or t == total_steps):
                 policy = evaluate.Policy(learner.policy())
                 rows = [evaluate.trial(eval_env, policy, i)[0] for i in range(flags.eval_trials)]
-                row["eval_success"] = np.mean([row["success"] for row in rows])
-                row["eval_return"] = np.mean([row["return"] for row in rows])
+                row["eval_success"] = float(np.mean([row["success"] for row in rows]))
+                row["eval_return"] = float(np.mean([row["return"] for row in rows]))
             row["seconds"] = run.seconds()
             run.write("progress", row)
             loop["epoch_log"], loop["epoch_episodes"] = [], []

@@ -114,16 +114,21 @@ def load_torch(path):
         raise ValueError(f"{path}: not a whole file of tensors ({str(error).splitlines()[0]})") from None
 
 
-class Run:
-    """One run folder. Another process that holds it, or a folder of an earlier run without `resume`, exits with 2."""
+def is_new(folder, resume):
+    """Whether a run in this folder starts from nothing (else: from its checkpoint); exits with 2 if it may not."""
+    if folder.exists() and not folder.is_dir():
+        fail(f"--name {folder.name}: {folder} is a file")
+    if folder.exists() and any(folder.iterdir()) and not resume:
+        fail(f"--name {folder.name}: {folder} exists; go on with --resume, or choose another --name")
+    return not (folder / "checkpoint.pt").exists()
 
-    def __init__(self, folder, config, resume=False, tensorboard=False):
+
+class Run:
+    """One run folder, held until the process ends; goes on from the checkpoint there, if any. What is wrong with the
+    folder, another process that holds it included, exits with 2."""
+
+    def __init__(self, folder, config, tensorboard=False):
         self.folder = Path(folder)
-        started = (self.folder / "config.json").exists()
-        if self.folder.exists() and not self.folder.is_dir():
-            fail(f"--name {self.folder.name}: {self.folder} is a file")
-        if started and not resume:
-            fail(f"--name {self.folder.name}: {self.folder} holds a run; go on with --resume, or choose another --name")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = open(self.folder / "lock", "w")  # noqa: SIM115 - held until the process ends
