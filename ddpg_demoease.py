@@ -71,6 +71,7 @@ class Flags:
                                                 low=1)  # fmt: skip
     # the parts of the robust recipe (ours)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
+    twin_critic: bool | None = flag(None, "a second critic, and the smaller of the two in Bellman targets (TD3)")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
     pretanh_penalty: float | None = flag(None, "times the mean u^2, a = tanh(u), in L_A; robust 1e-3", low=0)
@@ -94,11 +95,11 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  pretanh_penalty=0.0, mask_after=0),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   pretanh_penalty=1e-3, mask_after=20_000),
-}
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, twin_critic=False, clip_target=False,
+                  normalize_q=False, pretanh_penalty=0.0, mask_after=0),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, twin_critic=True, clip_target=True,
+                   normalize_q=True, pretanh_penalty=1e-3, mask_after=20_000),
+}  # fmt: skip
 QUICK = dict(recipe="robust", epochs=15)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
@@ -230,14 +231,15 @@ class ActorCritic(nn.Module):
     """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R. All weights, and all gradients, lie in one vector
     each (`flat`, `grad`; `mu` and `nu` are its two parts), so that optimiser and target update are one operation."""
 
-    def __init__(self, obs_dim, hidden_sizes, critic_layernorm, device):
+    def __init__(self, obs_dim, hidden_sizes, critic_layernorm, twin_critic, device):
         super().__init__()
         self.u = mlp([obs_dim, *hidden_sizes, 4])  # pre-tanh
         self.q = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
+        self.q2 = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm) if twin_critic else None
         self.flat = torch.cat([p.detach().flatten() for p in self.parameters()]).to(device)
         self.grad = torch.zeros_like(self.flat)
         i, self.layers = 0, {}
-        for net in (self.u, self.q):
+        for net in filter(None, (self.u, self.q, self.q2)):
             self.layers[net] = []
             for layer in net:
                 self.layers[net].append([type(layer)])
@@ -256,10 +258,11 @@ class ActorCritic(nn.Module):
     def pi(self, s):
         return torch.tanh(self.pre_tanh(s))
 
-    def Q(self, s, a, train=0, alive=0):
-        """Q_nu of (n, obs_dim) and (n, 4). In a backward pass the first `train` rows reach the critic's weights, rows
-        train to alive reach the actions, and the rest nothing."""
-        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, self.layers[self.q], train, alive).squeeze(1)
+    def Q(self, s, a, train=0, alive=0, second=False):
+        """Q_nu of (n, obs_dim) and (n, 4), or the second critic's. In a backward pass the first `train` rows reach the
+        critic's weights, rows train to alive reach the actions, and the rest nothing."""
+        layers = self.layers[self.q2 if second else self.q]
+        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, layers, train, alive).squeeze(1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -299,7 +302,7 @@ class Learner:
 
     def __init__(self, flags, obs_dim):
         self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1)
-        sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.device)
+        sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.twin_critic, flags.device)
         self.net, self.target = ActorCritic(*sizes), ActorCritic(*sizes)
         self.target.flat.copy_(self.net.flat)
         groups = [dict(params=[self.net.mu], lr=flags.pi_lr), dict(params=[self.net.nu], lr=flags.q_lr)]
@@ -334,7 +337,11 @@ class Learner:
         n, n_demo = len(s), len(s_demo)
 
         with torch.no_grad():
-            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
+            a2 = self.target.pi(s2)
+            Q_s2 = self.target.Q(s2, a2)
+            if f.twin_critic:
+                Q_s2 = torch.minimum(Q_s2, self.target.Q(s2, a2, second=True))
+            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * Q_s2
             if f.clip_target:
                 y = y.clamp(*self.return_range)
         u = self.net.pre_tanh(torch.cat((s, s_demo)))
@@ -343,6 +350,8 @@ class Learner:
         Q = self.net.Q(torch.cat((s, s, s_demo, s_demo)), torch.cat((a, a_pi, a_hat.detach(), a_demo)), n, 2 * n)
         Q_s_a, Q_s_pi, Q_own, Q_demo = Q.split((n, n, n_demo, n_demo))
         L_C = loss_C(Q_s_a, y)
+        if f.twin_critic:
+            L_C = L_C + loss_C(self.net.Q(s, a, n, n, second=True), y)
         L_O = L_A = loss_O(Q_s_pi, f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:

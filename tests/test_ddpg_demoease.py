@@ -51,11 +51,12 @@ def rows_of(path):
 class Paper:
     """ag:d-ease-off, eq:loss_actor, eq:bc_gain and eq:mask_q in plain autograd with two torch.optim.Adam.
 
-    Shares nothing with the source but the weights it starts from.
+    Shares nothing with the source but the weights it starts from. clip, normalize, penalty: the robust recipe's parts.
     """
 
-    def __init__(self, learner, obs_dim, hidden, layernorm, gamma, omega, lambda_bc, pi_lr, q_lr, clip, normalize):
-        self.settings = gamma, omega, lambda_bc, clip, normalize
+    def __init__(self, learner, obs_dim, hidden, layernorm, gamma, omega, lambda_bc, pi_lr, q_lr, clip, normalize,
+                 penalty):  # fmt: skip
+        self.settings = gamma, omega, lambda_bc, clip, normalize, penalty
 
         def network(n_in, n_out, norm):
             layers = []
@@ -80,7 +81,7 @@ class Paper:
 
     def update(self, batch, demo):
         """One step. batch: (s, a, r, s2, zeta), demo: (s, a) or None. Returns its figures, floats by name."""
-        gamma, omega, lambda_bc, clip, normalize = self.settings
+        gamma, omega, lambda_bc, clip, normalize, penalty = self.settings
         s, a, r, s2, zeta = batch
         with torch.no_grad():
             a2 = torch.tanh(self.u_target(s2))
@@ -92,7 +93,7 @@ class Paper:
         Q_pi = self.Q(s, self.pi(s))
         L_O = -torch.sum(Q_pi) / len(s)
         if normalize:
-            L_O = L_O / float(abs(torch.sum(Q_pi) / len(s)))
+            L_O = L_O / abs(torch.sum(Q_pi) / len(s)).item()
         L_A, figures = L_O, {}
         if demo is not None:
             s_d, a_d = demo
@@ -108,7 +109,8 @@ class Paper:
             }
         figures |= {"L_O": L_O, "L_C": L_C, "L_A": L_A, "Q_mean": Q.mean(), "Q_max": Q.max()}
         figures |= {"pretanh_own": self.u(s).abs().mean()}
-        self.gradients = [torch.autograd.grad(L_A, self.mu, retain_graph=True), torch.autograd.grad(L_C, self.nu)]
+        descended = L_A + penalty * torch.mean(self.u(s) ** 2)
+        self.gradients = [torch.autograd.grad(descended, self.mu, retain_graph=True), torch.autograd.grad(L_C, self.nu)]
         for parameters, gradients in zip((self.mu, self.nu), self.gradients, strict=True):
             for p, g in zip(parameters, gradients, strict=True):
                 p.grad = g
@@ -136,9 +138,11 @@ def batch_of(n, obs_dim, generator, scale=4.0):
 def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(task, obs_dim, clip, recipe, with_demos):
     torch.manual_seed(1)
     settings = dict(gamma=0.9, polyak=0.8, lambda_bc=1.3, pi_lr=2e-3, q_lr=5e-3)
+    settings |= dict(pretanh_penalty=0.05) if recipe == "robust" else {}
     flags = complete(task=task, recipe=recipe, hidden_sizes=(24, 40, 16), **settings)
     learner, robust = ddpg.Learner(flags, obs_dim), recipe == "robust"
-    paper = Paper(learner, obs_dim, (24, 40, 16), robust, 0.9, 0.8, 1.3, 2e-3, 5e-3, clip if robust else None, robust)
+    paper = Paper(learner, obs_dim, (24, 40, 16), robust, 0.9, 0.8, 1.3, 2e-3, 5e-3, clip if robust else None, robust,
+                  0.05 if robust else 0)  # fmt: skip
     generator = torch.Generator().manual_seed(2)
     fractions = []
     for _ in range(6):
@@ -159,6 +163,22 @@ def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(task, obs_di
                 torch.testing.assert_close(q.detach(), p.detach(), rtol=0, atol=2e-5)
     if with_demos:
         assert min(fractions) > 0 and max(fractions) < 1  # the mask mattered
+
+
+def test_without_the_mask_every_demonstration_is_cloned_and_the_mask_is_measured_all_the_same():
+    flags = complete(hidden_sizes=(16, 16), lambda_bc=2.0)
+    rows, _ = batch_of(40, 22, torch.Generator().manual_seed(0))
+    measured = []
+    for masked in (True, False):
+        torch.manual_seed(0)
+        learner = ddpg.Learner(flags, 22)
+        with torch.no_grad():
+            error = ((learner.net.pi(rows[:, :22]) - rows[:, 22:26]) ** 2).mean().item()
+        measured.append({k: v.item() for k, v in learner.update(rows, rows, masked, measure=True).items()})
+    with_mask, without = measured
+    assert without["L_BC"] == pytest.approx(error) and with_mask["L_BC"] < 0.9 * error
+    assert 0 < with_mask["mask_fraction"] == without["mask_fraction"] < 1
+    assert without["L_A"] == pytest.approx(without["L_O"] + 2 * error)
 
 
 def test_an_update_moves_every_network_and_the_policy_that_is_saved_is_the_one_that_acts():
@@ -376,8 +396,10 @@ DEFAULTS = {  # by hand from tab:reward and the text above it; N, lambda, 5 T, 2
 BOTH_TASKS = dict(replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1, polyak=0.995,
                   pi_lr=1e-3, q_lr=1e-3, partitions=4, seed=0, device="cpu", data_dir="data/runs")  # fmt: skip
 RECIPES = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
+                  pretanh_penalty=0, mask_after=0),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
+                   pretanh_penalty=1e-3, mask_after=20_000),
 }
 
 
@@ -614,10 +636,10 @@ def test_updates_begin_after_update_after_and_come_in_blocks_of_update_every(wor
     blocks, updates, batches = [], [], []
     block, update = ddpg.Learner.block, ddpg.Learner.update
 
-    def counted_block(self, B_o, B_d):
+    def counted_block(self, B_o, B_d, *args, **kwargs):
         updates.append(0)
         blocks.append(B_o.filled)
-        return block(self, B_o, B_d)
+        return block(self, B_o, B_d, *args, **kwargs)
 
     def counted_update(self, rows, rows_demo, *args, **kwargs):
         updates[-1] += 1
@@ -637,9 +659,23 @@ def test_updates_begin_after_update_after_and_come_in_blocks_of_update_every(wor
 
 def test_updates_begin_at_update_after_itself_where_a_block_is_due(world, monkeypatch):
     blocks, block = [], ddpg.Learner.block
-    monkeypatch.setattr(ddpg.Learner, "block", lambda *args: blocks.append(args[1].filled) or block(*args))
+    monkeypatch.setattr(ddpg.Learner, "block", lambda *a, **kw: blocks.append(a[1].filled) or block(*a, **kw))
     world("a", update_after=28, update_every=7, epochs=1, steps_per_epoch=60)
     assert blocks == [28, 35, 42, 49, 56]
+
+
+@pytest.mark.parametrize("mask_after", [0, 90, 999])
+def test_the_mask_is_used_after_mask_after_steps(world, monkeypatch, mask_after):
+    masks, update = [], ddpg.Learner.update
+
+    def noted(self, rows, rows_demo, masked, *args, **kwargs):
+        masks.append(masked)
+        return update(self, rows, rows_demo, masked, *args, **kwargs)
+
+    monkeypatch.setattr(ddpg.Learner, "update", noted)
+    monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: (demo_arrays(), 18))
+    world("a", num_demos=4, lambda_bc=1.0, mask_after=mask_after)
+    assert masks == [t > mask_after for t in range(63, 121, 7) for _ in range(7)]
 
 
 @pytest.mark.parametrize("symmetry", ["so2", "none"])
@@ -704,8 +740,8 @@ def test_epochs_cut_nothing(world):
 def test_a_row_of_progress_averages_its_own_epoch(world, monkeypatch):
     blocks, block = [], ddpg.Learner.block
 
-    def noted(self, B_o, B_d):
-        blocks.append((B_o.filled, block(self, B_o, B_d)))
+    def noted(self, B_o, B_d, *args, **kwargs):
+        blocks.append((B_o.filled, block(self, B_o, B_d, *args, **kwargs)))
         return blocks[-1][1]
 
     monkeypatch.setattr(ddpg.Learner, "block", noted)
@@ -740,13 +776,14 @@ def test_evaluation_is_logged_and_changes_nothing_in_the_run(plain, world):
     assert curves(silent)[0] == curves(evaluated)[0] and curves(silent)[2] == curves(evaluated)[2]
 
 
-@pytest.mark.parametrize("at", [5, 41, 63, 79, 80, 81, 119])
-def test_an_interrupted_run_resumes_as_if_it_had_never_stopped(plain, world, at):
+@pytest.mark.parametrize("number, at", [*((signal.SIGINT, at) for at in (5, 63, 79, 80, 81, 119)),
+                                        (signal.SIGTERM, 41)])  # fmt: skip
+def test_an_interrupted_run_resumes_as_if_it_had_never_stopped(plain, world, number, at):
     """Also between the last update of an epoch (at 77) and its end (at 80)."""
 
     def interrupt(n):
         if n == at:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     folder, env = world("a", at_step=interrupt)
     assert env.exit_code == 130 and len(env.steps) == at
@@ -754,6 +791,13 @@ def test_an_interrupted_run_resumes_as_if_it_had_never_stopped(plain, world, at)
     assert json.loads(saved["loop"])["t"] == at
     folder, env = world("a", resume=True)
     assert env.exit_code is None and curves(folder) == curves(plain[0])
+
+
+def test_after_a_run_an_interrupt_is_an_interrupt_again(world):
+    """As in the test trials that end a --quick run."""
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    world("a", epochs=1)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
 def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(plain, world):

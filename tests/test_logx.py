@@ -9,6 +9,7 @@ import random
 import re
 import subprocess
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 import torch
@@ -46,6 +47,12 @@ def error_line(capsys, call, *args, **kwargs):
     out, err = capsys.readouterr()
     assert stopped.value.code == 2 and not out and err.count("\n") == 1, (stopped.value.code, out, err)
     return err
+
+
+def begin(folder, config, resume=False, tensorboard=False):
+    """A run as the training scripts begin it."""
+    logx.is_new(folder, resume)
+    return logx.Run(folder, config, tensorboard)
 
 
 def close(run):
@@ -116,17 +123,16 @@ def test_help_shows_the_docstring_every_flag_and_the_help_texts(capsys):
     (dict(epochs=6), "--epochs 6: must be at least 1 and at most 5"),
     (dict(count=-1), "--count -1: must be at least 0"),
     (dict(gain=-0.5), "--gain -0.5: must be at least 0"),
-    (dict(gain=math.nan), "--gain nan: must be at least 0"),
-    (dict(rate=math.nan), "--rate nan: must be a number"),
     (dict(sizes=(4, 0, 2)), "--sizes 0: must be at least 1"),
 ])  # fmt: skip
 def test_a_number_out_of_range_is_named_with_what_is_allowed(capsys, changed, message):
     assert error_line(capsys, logx.check_ranges, Flags(**changed)).strip().endswith(message)
 
 
-@pytest.mark.parametrize("field", ["rate", "gain"])
-def test_an_infinite_number_is_out_of_every_range(capsys, field):
-    assert f"--{field} inf" in error_line(capsys, logx.check_ranges, Flags(**{field: math.inf}))
+@pytest.mark.parametrize("field", ["rate", "gain"])  # without bounds and with one
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_nan_and_infinity_are_out_of_every_range(capsys, field, value):
+    assert f"--{field} {value}: must be" in error_line(capsys, logx.check_ranges, Flags(**{field: value}))
 
 
 def test_the_bounds_themselves_and_what_is_not_given_are_in_range():
@@ -279,7 +285,7 @@ def test_versions_do_without_git_and_without_a_package(monkeypatch):
 
 
 def test_a_new_run_has_its_config_its_command_and_empty_curves(tmp_path):
-    run = logx.Run(tmp_path / "deep" / "a", CONFIG)
+    run = begin(tmp_path / "deep" / "a", CONFIG)
     config = json.loads(text(run.folder / "config.json"))
     assert config.pop("command") and config.pop("versions")["torch"] == torch.__version__
     assert config == json.loads(json.dumps(CONFIG)) and run.checkpoint is None
@@ -290,7 +296,7 @@ def test_a_new_run_has_its_config_its_command_and_empty_curves(tmp_path):
 
 
 def test_write_puts_values_under_their_columns_and_leaves_none_nan_and_missing_blank(tmp_path):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"collision": "self", "episode": 1, "env_steps": 88, "return": -2.25, "length": 88,
                            "success": 0})  # fmt: skip
     run.write("progress", {"epoch": 1, "env_steps": 300, "EpRet": None, "L_BC": math.nan, "L_O": -1 / 3, "Q_max": 0.0})
@@ -300,7 +306,7 @@ def test_write_puts_values_under_their_columns_and_leaves_none_nan_and_missing_b
 
 
 def test_a_resume_cuts_both_curves_back_to_the_checkpoint_and_goes_on_from_there(tmp_path):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     for n in (1, 2):
         run.write("episodes", {"episode": n})
     run.write("progress", {"epoch": 1})
@@ -310,7 +316,7 @@ def test_a_resume_cuts_both_curves_back_to_the_checkpoint_and_goes_on_from_there
     close(run)
     with open(tmp_path / "a" / "episodes.csv", "a") as file:
         file.write("4,3")  # a row cut off by a kill
-    again = logx.Run(tmp_path / "a", CONFIG, resume=True)
+    again = begin(tmp_path / "a", CONFIG, resume=True)
     assert torch.equal(again.checkpoint["tensor"], torch.arange(3))
     assert [line.split(",")[0] for line in text(tmp_path / "a" / "episodes.csv").splitlines()] == ["episode", "1", "2"]
     assert [line.split(",")[0] for line in text(tmp_path / "a" / "progress.csv").splitlines()] == ["epoch", "1"]
@@ -318,98 +324,108 @@ def test_a_resume_cuts_both_curves_back_to_the_checkpoint_and_goes_on_from_there
     assert text(tmp_path / "a" / "episodes.csv").endswith("\n2,,,,,\n3,,,,,\n")
 
 
+def test_a_run_is_new_until_it_has_a_checkpoint(tmp_path):
+    assert logx.is_new(tmp_path / "a", False) and logx.is_new(tmp_path / "a", True)
+    (tmp_path / "a").mkdir()
+    assert logx.is_new(tmp_path / "a", False) and logx.is_new(tmp_path / "a", True)
+    run = begin(tmp_path / "a", CONFIG)
+    assert logx.is_new(tmp_path / "a", True)
+    run.save({}, CONFIG)
+    assert not logx.is_new(tmp_path / "a", True)
+
+
 def test_a_resume_without_a_checkpoint_starts_anew(tmp_path):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
     close(run)
-    again = logx.Run(tmp_path / "a", CONFIG, resume=True)
+    again = begin(tmp_path / "a", CONFIG, resume=True)
     assert again.checkpoint is None and text(tmp_path / "a" / "episodes.csv").count("\n") == 1
 
 
 def test_the_seconds_of_a_resumed_run_include_the_earlier_parts(tmp_path, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(logx.time, "monotonic", lambda: now[0])
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     now[0] += 7
     run.save({}, CONFIG)
     now[0] += 1000  # not the run's
     close(run)
-    again = logx.Run(tmp_path / "a", CONFIG, resume=True)
+    again = begin(tmp_path / "a", CONFIG, resume=True)
     now[0] += 5
     assert again.seconds() == 12
 
 
 def test_a_run_is_not_begun_twice_in_one_folder_but_by_a_resume(tmp_path, capsys):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
     close(run)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
-    line = error_line(capsys, logx.Run, tmp_path / "a", CONFIG)
+    line = error_line(capsys, begin, tmp_path / "a", CONFIG)
     assert "--resume" in line and "--name" in line
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
 
 
 def test_a_run_that_is_held_is_refused_until_it_is_let_go(tmp_path, capsys):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
-    assert "another process" in error_line(capsys, logx.Run, tmp_path / "a", CONFIG, resume=True)
+    assert "another process" in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
     assert text(tmp_path / "a" / "episodes.csv").endswith("\n1,,,,,\n")  # the refused one touched nothing
     close(run)
-    assert logx.Run(tmp_path / "a", CONFIG, resume=True).checkpoint is None
+    assert begin(tmp_path / "a", CONFIG, resume=True).checkpoint is None
 
 
 @pytest.mark.parametrize("key, value", [("gamma", 0.9), ("seed", 1), ("hidden_sizes", (16, 8)), ("task", "pnp")])
 def test_a_checkpoint_goes_on_only_with_the_flags_it_was_made_with(tmp_path, capsys, key, value):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
     run.save({}, CONFIG)
     run.write("episodes", {"episode": 2})
     close(run)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
-    line = error_line(capsys, logx.Run, tmp_path / "a", CONFIG | {key: value}, resume=True)
+    line = error_line(capsys, begin, tmp_path / "a", CONFIG | {key: value}, resume=True)
     assert f"--{key}" in line
     assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
 
 
 def test_how_long_how_loud_and_where_may_change_on_a_resume(tmp_path):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.save({}, CONFIG)
     close(run)
     changed = CONFIG | dict(epochs=9, name="b", quiet=True, data_dir="x", resume=True, checkpoint_every=2)
-    again = logx.Run(tmp_path / "a", changed, resume=True)
+    again = begin(tmp_path / "a", changed, resume=True)
     assert again.checkpoint is not None and json.loads(text(tmp_path / "a" / "config.json"))["epochs"] == 9
 
 
 def test_a_broken_checkpoint_is_named_and_the_curves_are_left_alone(tmp_path, capsys):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
     run.save({"t": torch.zeros(100)}, CONFIG)
     close(run)
     path = tmp_path / "a" / "checkpoint.pt"
     path.write_bytes(path.read_bytes()[:-50])
-    assert str(path) in error_line(capsys, logx.Run, tmp_path / "a", CONFIG, resume=True)
+    assert str(path) in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
     assert text(tmp_path / "a" / "episodes.csv").endswith("\n1,,,,,\n")
 
 
-@pytest.mark.parametrize("shorten", [lambda p: p.unlink(), lambda p: p.write_bytes(p.read_bytes()[:-3])])
+@pytest.mark.parametrize("shorten", [Path.unlink, lambda p: p.write_bytes(p.read_bytes()[:-3])], ids=["gone", "cut"])
 def test_a_curve_shorter_than_its_checkpoint_is_refused_by_name(tmp_path, capsys, shorten):
-    run = logx.Run(tmp_path / "a", CONFIG)
+    run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
     run.save({}, CONFIG)
     close(run)
     shorten(tmp_path / "a" / "episodes.csv")
-    assert "episodes.csv" in error_line(capsys, logx.Run, tmp_path / "a", CONFIG, resume=True)
+    assert "episodes.csv" in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
 
 
 @pytest.mark.parametrize("where", ["file/a", "file", "x" * 300])
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys, where):
     (tmp_path / "file").write_text("")
-    line = error_line(capsys, logx.Run, tmp_path / where, CONFIG)
+    line = error_line(capsys, begin, tmp_path / where, CONFIG)
     assert "--data_dir" in line or "--name" in line
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_tensorboard_that_is_not_installed_is_bad_input_and_leaves_no_folder(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(logx.sys.modules, "torch.utils.tensorboard", None)
-    assert "--tensorboard" in error_line(capsys, logx.Run, tmp_path / "a", CONFIG, tensorboard=True)
+    assert "--tensorboard" in error_line(capsys, begin, tmp_path / "a", CONFIG, tensorboard=True)
     assert not list(tmp_path.iterdir())
