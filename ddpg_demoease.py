@@ -71,11 +71,8 @@ class Flags:
                                                 low=1)  # fmt: skip
     # the parts of the robust recipe (ours)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
-    twin_critic: bool | None = flag(None, "a second critic, and the smaller of the two in Bellman targets (TD3)")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
-    pretanh_penalty: float | None = flag(None, "times the mean u^2, a = tanh(u), in L_A; robust 1e-3", low=0)
-    mask_after: int | None = flag(None, "steps before which M_t = 1, whatever the critic thinks; paper 0", low=0)
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -95,11 +92,9 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, twin_critic=False, clip_target=False,
-                  normalize_q=False, pretanh_penalty=0.0, mask_after=0),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, twin_critic=True, clip_target=True,
-                   normalize_q=True, pretanh_penalty=1e-3, mask_after=20_000),
-}  # fmt: skip
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
+}
 QUICK = dict(recipe="robust", epochs=15)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
@@ -231,15 +226,14 @@ class ActorCritic(nn.Module):
     """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R. All weights, and all gradients, lie in one vector
     each (`flat`, `grad`; `mu` and `nu` are its two parts), so that optimiser and target update are one operation."""
 
-    def __init__(self, obs_dim, hidden_sizes, critic_layernorm, twin_critic, device):
+    def __init__(self, obs_dim, hidden_sizes, critic_layernorm, device):
         super().__init__()
         self.u = mlp([obs_dim, *hidden_sizes, 4])  # pre-tanh
         self.q = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
-        self.q2 = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm) if twin_critic else None
         self.flat = torch.cat([p.detach().flatten() for p in self.parameters()]).to(device)
         self.grad = torch.zeros_like(self.flat)
         i, self.layers = 0, {}
-        for net in filter(None, (self.u, self.q, self.q2)):
+        for net in (self.u, self.q):
             self.layers[net] = []
             for layer in net:
                 self.layers[net].append([type(layer)])
@@ -258,11 +252,10 @@ class ActorCritic(nn.Module):
     def pi(self, s):
         return torch.tanh(self.pre_tanh(s))
 
-    def Q(self, s, a, train=0, alive=0, second=False):
-        """Q_nu of (n, obs_dim) and (n, 4), or the second critic's. In a backward pass the first `train` rows reach the
-        critic's weights, rows train to alive reach the actions, and the rest nothing."""
-        layers = self.layers[self.q2 if second else self.q]
-        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, layers, train, alive).squeeze(1)
+    def Q(self, s, a, train=0, alive=0):
+        """Q_nu of (n, obs_dim) and (n, 4). In a backward pass the first `train` rows reach the critic's weights, rows
+        train to alive reach the actions, and the rest nothing."""
+        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, self.layers[self.q], train, alive).squeeze(1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -302,7 +295,7 @@ class Learner:
 
     def __init__(self, flags, obs_dim):
         self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1)
-        sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.twin_critic, flags.device)
+        sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.device)
         self.net, self.target = ActorCritic(*sizes), ActorCritic(*sizes)
         self.target.flat.copy_(self.net.flat)
         groups = [dict(params=[self.net.mu], lr=flags.pi_lr), dict(params=[self.net.nu], lr=flags.q_lr)]
@@ -310,7 +303,7 @@ class Learner:
         self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
 
-    def block(self, B_o, B_d, masked=True):
+    def block(self, B_o, B_d):
         """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name."""
         f = self.flags
         n = f.update_every
@@ -321,15 +314,15 @@ class Learner:
         rows = rows.to(f.device)
         batches = [(o, d) for o, d in zip(rows, rows_demo.to(f.device) if B_d else [None] * n, strict=True)]
         for rows, rows_demo in batches[:-1]:
-            self.update(rows, rows_demo, masked)
-        measured = self.update(*batches[-1], masked, measure=True)
+            self.update(rows, rows_demo)
+        measured = self.update(*batches[-1], measure=True)
         if self.actor is not self.net.u:
             with torch.no_grad():
                 for p, q in zip(self.actor.parameters(), self.net.u.parameters(), strict=True):
                     p.copy_(q)
         return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
 
-    def update(self, rows, rows_demo, masked=True, measure=False):
+    def update(self, rows, rows_demo, measure=False):
         """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). measure: returns tensors."""
         f = self.flags
         s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
@@ -337,11 +330,7 @@ class Learner:
         n, n_demo = len(s), len(s_demo)
 
         with torch.no_grad():
-            a2 = self.target.pi(s2)
-            Q_s2 = self.target.Q(s2, a2)
-            if f.twin_critic:
-                Q_s2 = torch.minimum(Q_s2, self.target.Q(s2, a2, second=True))
-            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * Q_s2
+            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
             if f.clip_target:
                 y = y.clamp(*self.return_range)
         u = self.net.pre_tanh(torch.cat((s, s_demo)))
@@ -350,17 +339,14 @@ class Learner:
         Q = self.net.Q(torch.cat((s, s, s_demo, s_demo)), torch.cat((a, a_pi, a_hat.detach(), a_demo)), n, 2 * n)
         Q_s_a, Q_s_pi, Q_own, Q_demo = Q.split((n, n, n_demo, n_demo))
         L_C = loss_C(Q_s_a, y)
-        if f.twin_critic:
-            L_C = L_C + loss_C(self.net.Q(s, a, n, n, second=True), y)
         L_O = L_A = loss_O(Q_s_pi, f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
             M = mask(Q_demo, Q_own)
-            L_BC = loss_BC(a_demo, a_hat, M if masked else torch.ones_like(M))
+            L_BC = loss_BC(a_demo, a_hat, M)
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
-        penalty = f.pretanh_penalty * (u[:n] ** 2).mean() if f.pretanh_penalty else 0.0
-        (L_C + L_A + penalty).backward()
+        (L_C + L_A).backward()
         self.optimizer.step()
         with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
             self.target.flat.lerp_(self.net.flat, 1 - f.polyak)
@@ -543,7 +529,7 @@ def train(flags, variant=""):
 
         # update
         if t >= flags.update_after and t % flags.update_every == 0:
-            measured = learner.block(B_o, B_d, masked=t > flags.mask_after)
+            measured = learner.block(B_o, B_d)
             loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
                 logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))
