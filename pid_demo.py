@@ -14,6 +14,8 @@ import argparse
 import json
 import math
 import os
+import zipfile
+import zlib
 from pathlib import Path
 
 import gymnasium
@@ -21,7 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
-from kinova_env import STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
+from kinova_env import OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
 
 CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it on P&P
 RETRACT = 0.35  # m, radius to which it draws back before it rises beside a cube on P2P-O
@@ -101,25 +103,25 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
     env = gymnasium.make(TASKS[task].env_id, stage=stage, partitions=partitions, disable_env_checker=True)
     pid = PID(env, gains)
     rows = {name: [] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")}
-    episodes = {name: [] for name in ("partition", "success", "length", "return")}
+    episodes = {name: [] for name in ("partition", "success", "length", "return", "effort")}
     real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
     env.reset(seed=seed)
     for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
         s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
-        total, length, terminated, truncated = 0.0, 0, False, False
+        total, effort, length, terminated, truncated = 0.0, 0.0, 0, False, False
         while not (terminated or truncated):
             a = pid.act()
             s2, r, terminated, truncated, info = env.step(a)
             for column, value in zip(rows.values(), (s, a, r, s2, terminated, truncated, n), strict=True):
                 column.append(value)
-            s, total, length = s2, total + r, length + 1
-        of_episode = (info.get("partition", 0), info["is_success"], length, total)
+            s, total, effort, length = s2, total + r, effort + info["effort"], length + 1
+        of_episode = (info.get("partition", 0), info["is_success"], length, total, 50 * effort / length)
         for column, value in zip(episodes.values(), of_episode, strict=True):
             column.append(value)
     width = env.observation_space.shape[0]
     env.close()
     dtypes = dict(obs="f4", act="f4", rew="f8", obs2="f4", terminated="?", truncated="?", episode="i8")
-    dtypes |= {"partition": "i8", "success": "?", "length": "i8", "return": "f8"}
+    dtypes |= {"partition": "i8", "success": "?", "length": "i8", "return": "f8", "effort": "f8"}
     demos = {name: np.array(column, dtype=dtypes[name]) for name, column in (rows | episodes).items()}
     for name, columns in (("obs", width), ("obs2", width), ("act", 4)):
         demos[name] = demos[name].reshape(-1, columns)  # also where there is no row
@@ -133,12 +135,16 @@ def load_demos(path, task):
         with np.load(path, allow_pickle=False) as file:
             demos = {name: file[name] for name in file.files}
         meta = json.loads(str(demos.pop("meta")))
-        lengths = {len(demos[name]) for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")}
-        if len(lengths) != 1 or demos["length"].sum() != lengths.pop() or not np.all(np.isfinite(demos["obs"])):
+        rows, episodes = demos["length"].sum(), len(demos["length"])
+        width = sum(width for _, width, _ in OBSERVATION[meta["task"]])
+        shapes = {"obs": (rows, width), "obs2": (rows, width), "act": (rows, 4)}
+        shapes |= dict.fromkeys(("rew", "terminated", "truncated", "episode"), (rows,))
+        shapes |= dict.fromkeys(("partition", "success", "length", "return"), (episodes,))
+        if any(demos[name].shape != shape or not np.all(np.isfinite(demos[name])) for name, shape in shapes.items()):
             raise ValueError("its arrays do not fit together")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
-    except (OSError, ValueError, KeyError, EOFError, __import__("zipfile").BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: not a demonstration file of pid_demo.py --record ({error})") from None
     if meta["task"] != task:
         raise ValueError(f"{path}: recorded on task {meta['task']}, not {task}")
@@ -197,8 +203,8 @@ def main():
         parser.error(f"--symmetry gas: needs --stage demo, not {flags.stage}")
     for name in ("out", "gif"):
         path = getattr(flags, name)
-        if path and not Path(path).absolute().parent.is_dir():
-            parser.error(f"--{name} {path}: its folder does not exist")
+        if path is not None and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
+            parser.error(f"--{name} {path}: is a folder, or its folder does not exist")
     gains = [
         own if own is not None else named
         for own, named in zip((flags.K_P, flags.K_D, flags.K_I), GAINS[flags.gains], strict=True)

@@ -51,56 +51,64 @@ def rows_of(path):
 class Paper:
     """ag:d-ease-off, eq:loss_actor, eq:bc_gain and eq:mask_q in plain autograd with two torch.optim.Adam.
 
-    Shares nothing with the source but the weights it starts from. clip, normalize, penalty: the robust recipe's parts.
+    Shares nothing with the source but the weights it starts from. The arguments from `layernorm` on are the parts of
+    the robust recipe (clip: the range of targets; penalty: times mean u^2; cloning: the actor only clones, unmasked).
     """
 
-    def __init__(self, learner, obs_dim, hidden, layernorm, gamma, omega, lambda_bc, pi_lr, q_lr, clip, normalize,
-                 penalty):  # fmt: skip
-        self.settings = gamma, omega, lambda_bc, clip, normalize, penalty
+    def __init__(self, learner, obs_dim, hidden, gamma, omega, lambda_bc, pi_lr, q_lr, layernorm=False, clip=None,
+                 normalize=False, twin=False, penalty=0.0, cloning=False):  # fmt: skip
+        self.gamma, self.omega, self.lambda_bc = gamma, omega, lambda_bc
+        self.clip, self.normalize, self.penalty, self.cloning = clip, normalize, penalty, cloning
 
-        def network(n_in, n_out, norm):
+        def copy_of(source, n_in, n_out, norm):
             layers = []
             for n in hidden:
                 layers += [nn.Linear(n_in, n)] + [nn.LayerNorm(n)] * norm + [nn.ReLU()]
                 n_in = n
-            return nn.Sequential(*layers, nn.Linear(n_in, n_out))
+            net = nn.Sequential(*layers, nn.Linear(n_in, n_out))
+            net.load_state_dict({name: w.clone() for name, w in source.state_dict().items()})  # strict
+            return net
 
-        self.u, self.u_target = network(obs_dim, 4, False), network(obs_dim, 4, False)
-        self.q, self.q_target = network(obs_dim + 4, 1, layernorm), network(obs_dim + 4, 1, layernorm)
-        for mine, theirs in ((self.u, learner.net.u), (self.u_target, learner.target.u),
-                             (self.q, learner.net.q), (self.q_target, learner.target.q)):  # fmt: skip
-            mine.load_state_dict({name: w.clone() for name, w in theirs.state_dict().items()})  # strict
-        self.mu, self.nu = list(self.u.parameters()), list(self.q.parameters())
+        critics = ["q", "q2"] if twin else ["q"]
+        self.u, self.u_target = (copy_of(nets.u, obs_dim, 4, False) for nets in (learner.net, learner.target))
+        self.qs, self.q_targets = ([copy_of(getattr(nets, name), obs_dim + 4, 1, layernorm) for name in critics]
+                                   for nets in (learner.net, learner.target))  # fmt: skip
+        self.mu, self.nu = list(self.u.parameters()), [p for q in self.qs for p in q.parameters()]
         self.adam_mu, self.adam_nu = torch.optim.Adam(self.mu, lr=pi_lr), torch.optim.Adam(self.nu, lr=q_lr)
-
-    def pi(self, s):
-        return torch.tanh(self.u(s))
-
-    def Q(self, s, a):
-        return self.q(torch.cat([s, a], -1))[:, 0]
+        self.pairs = [(self.u, learner.net.u), (self.u_target, learner.target.u)]
+        for mine, nets in ((self.qs, learner.net), (self.q_targets, learner.target)):
+            self.pairs += [(net, getattr(nets, name)) for net, name in zip(mine, critics, strict=True)]
 
     def update(self, batch, demo):
         """One step. batch: (s, a, r, s2, zeta), demo: (s, a) or None. Returns its figures, floats by name."""
-        gamma, omega, lambda_bc, clip, normalize, penalty = self.settings
         s, a, r, s2, zeta = batch
+
+        def value(q, s, a):
+            return q(torch.cat([s, a], -1))[:, 0]
+
+        def pi(s):
+            return torch.tanh(self.u(s))
+
         with torch.no_grad():
             a2 = torch.tanh(self.u_target(s2))
-            y = r + gamma * (1 - zeta) * self.q_target(torch.cat([s2, a2], -1))[:, 0]
-            if clip:
-                y = torch.clip(y, clip[0], clip[1])
-        Q = self.Q(s, a)
-        L_C = torch.sum((r * 0 + y - Q) ** 2) / len(s)
-        Q_pi = self.Q(s, self.pi(s))
+            Q2 = torch.stack([value(q, s2, a2) for q in self.q_targets]).min(dim=0).values
+            y = r + self.gamma * (1 - zeta) * Q2
+            if self.clip:
+                y = torch.clip(y, self.clip[0], self.clip[1])
+        L_C = sum(torch.sum((y - value(q, s, a)) ** 2) / len(s) for q in self.qs)
+        q = self.qs[0]
+        Q, Q_pi = value(q, s, a), value(q, s, pi(s))
         L_O = -torch.sum(Q_pi) / len(s)
-        if normalize:
+        if self.normalize:
             L_O = L_O / abs(torch.sum(Q_pi) / len(s)).item()
         L_A, figures = L_O, {}
         if demo is not None:
             s_d, a_d = demo
-            a_hat = self.pi(s_d)
-            M = self.Q(s_d, a_hat) < self.Q(s_d, a_d)
-            L_BC = torch.sum((a_d[M] - a_hat[M]) ** 2) / (4 * len(s_d))
-            L_A = L_O + lambda_bc * L_BC
+            a_hat = pi(s_d)
+            M = value(q, s_d, a_hat) < value(q, s_d, a_d)
+            used = torch.ones_like(M) if self.cloning else M
+            L_BC = torch.sum((a_d[used] - a_hat[used]) ** 2) / (4 * len(s_d))
+            L_A = self.lambda_bc * L_BC + (0 if self.cloning else L_O)
             figures = {
                 "L_BC": L_BC,
                 "mask_fraction": M.float().mean(),
@@ -109,7 +117,7 @@ class Paper:
             }
         figures |= {"L_O": L_O, "L_C": L_C, "L_A": L_A, "Q_mean": Q.mean(), "Q_max": Q.max()}
         figures |= {"pretanh_own": self.u(s).abs().mean()}
-        descended = L_A + penalty * torch.mean(self.u(s) ** 2)
+        descended = L_A + self.penalty * torch.mean(self.u(s) ** 2)
         self.gradients = [torch.autograd.grad(descended, self.mu, retain_graph=True), torch.autograd.grad(L_C, self.nu)]
         for parameters, gradients in zip((self.mu, self.nu), self.gradients, strict=True):
             for p, g in zip(parameters, gradients, strict=True):
@@ -117,9 +125,9 @@ class Paper:
         self.adam_mu.step()
         self.adam_nu.step()
         with torch.no_grad():
-            for target, now in ((self.u_target, self.u), (self.q_target, self.q)):
+            for target, now in zip([self.u_target, *self.q_targets], [self.u, *self.qs], strict=True):
                 for p2, p in zip(target.parameters(), now.parameters(), strict=True):
-                    p2.copy_(omega * p2 + (1 - omega) * p)
+                    p2.copy_(self.omega * p2 + (1 - self.omega) * p)
         return {name: value.item() for name, value in figures.items()}
 
 
@@ -132,53 +140,53 @@ def batch_of(n, obs_dim, generator, scale=4.0):
     return torch.cat([s, a, r[:, None], s2, zeta[:, None]], dim=1), (s, a, r, s2, zeta)
 
 
-@pytest.mark.parametrize("with_demos", [True, False], ids=["with B_d", "without B_d"])
-@pytest.mark.parametrize("recipe", ["paper", "robust"])
-@pytest.mark.parametrize("task, obs_dim, clip", [("p2p", 22, (-4.0, 10.0)), ("pnp", 25, (-4.0, 12.0))])
-def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(task, obs_dim, clip, recipe, with_demos):
+PARTS = {  # flags of the source, and the same in the reimplementation
+    "paper": (dict(recipe="paper"), dict()),
+    "layernorm": (dict(critic_layernorm=True), dict(layernorm=True)),
+    "clip": (dict(clip_target=True), dict(clip=True)),
+    "normalize": (dict(normalize_q=True), dict(normalize=True)),
+    "twin": (dict(twin_critic=True), dict(twin=True)),
+    "penalty": (dict(pretanh_penalty=0.05), dict(penalty=0.05)),
+    "cloning": (dict(), dict(cloning=True)),
+    "robust": (dict(recipe="robust", pretanh_penalty=0.05),
+               dict(layernorm=True, clip=True, normalize=True, twin=True, penalty=0.05)),
+}  # fmt: skip
+PARTS["robust cloning"] = PARTS["robust"][0], PARTS["robust"][1] | dict(cloning=True)
+
+
+@pytest.mark.parametrize("task, part, with_demos", [
+    *(("p2p", part, True) for part in PARTS), ("p2p", "paper", False), ("p2p", "robust", False),
+    ("pnp", "paper", True), ("pnp", "robust", True),
+], ids=lambda x: ("with B_d" if x else "without B_d") if isinstance(x, bool) else x)  # fmt: skip
+def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(task, part, with_demos):
     torch.manual_seed(1)
-    settings = dict(gamma=0.9, polyak=0.8, lambda_bc=1.3, pi_lr=2e-3, q_lr=5e-3)
-    settings |= dict(pretanh_penalty=0.05) if recipe == "robust" else {}
-    flags = complete(task=task, recipe=recipe, hidden_sizes=(24, 40, 16), **settings)
-    learner, robust = ddpg.Learner(flags, obs_dim), recipe == "robust"
-    paper = Paper(learner, obs_dim, (24, 40, 16), robust, 0.9, 0.8, 1.3, 2e-3, 5e-3, clip if robust else None, robust,
-                  0.05 if robust else 0)  # fmt: skip
+    theirs, mine = PARTS[part]
+    if "clip" in mine:
+        mine = mine | dict(clip={"p2p": (-4, 10), "pnp": (-4, 12)}[task])
+    hidden, obs_dim = (24, 40, 16), {"p2p": 22, "pnp": 25}[task]
+    flags = complete(task=task, hidden_sizes=hidden, gamma=0.9, polyak=0.8, lambda_bc=1.3, pi_lr=2e-3, q_lr=5e-3,
+                     **theirs)  # fmt: skip
+    learner = ddpg.Learner(flags, obs_dim)
+    paper = Paper(learner, obs_dim, hidden, 0.9, 0.8, 1.3, 2e-3, 5e-3, **mine)
     generator = torch.Generator().manual_seed(2)
     fractions = []
     for _ in range(6):
         rows, batch = batch_of(48, obs_dim, generator, scale=8.0)  # some targets are beyond the clip
         rows_demo, (s_d, a_d, *_) = batch_of(30, obs_dim, generator)
         expected = paper.update(batch, (s_d, a_d) if with_demos else None)
-        measured = learner.update(rows, rows_demo if with_demos else None, measure=True)
-        measured = {name: float(value) for name, value in measured.items()}
+        measured = learner.update(rows, rows_demo if with_demos else None, cloning=paper.cloning, measure=True)
+        measured = {name: value.item() for name, value in measured.items()}
         for name, value in expected.items():
             assert measured.pop(name) == pytest.approx(value, rel=1e-4, abs=1e-5), name
         assert all(math.isnan(value) for value in measured.values())  # what needs B_d, without it
         fractions.append(expected.get("mask_fraction"))
         for vector, gradients in zip((learner.net.mu, learner.net.nu), paper.gradients, strict=True):
             torch.testing.assert_close(vector.grad, torch.cat([g.flatten() for g in gradients]), rtol=1e-3, atol=2e-6)
-        for mine, theirs in ((paper.u, learner.net.u), (paper.u_target, learner.target.u),
-                             (paper.q, learner.net.q), (paper.q_target, learner.target.q)):  # fmt: skip
+        for mine, theirs in paper.pairs:
             for p, q in zip(mine.parameters(), theirs.parameters(), strict=True):
                 torch.testing.assert_close(q.detach(), p.detach(), rtol=0, atol=2e-5)
     if with_demos:
         assert min(fractions) > 0 and max(fractions) < 1  # the mask mattered
-
-
-def test_without_the_mask_every_demonstration_is_cloned_and_the_mask_is_measured_all_the_same():
-    flags = complete(hidden_sizes=(16, 16), lambda_bc=2.0)
-    rows, _ = batch_of(40, 22, torch.Generator().manual_seed(0))
-    measured = []
-    for masked in (True, False):
-        torch.manual_seed(0)
-        learner = ddpg.Learner(flags, 22)
-        with torch.no_grad():
-            error = ((learner.net.pi(rows[:, :22]) - rows[:, 22:26]) ** 2).mean().item()
-        measured.append({k: v.item() for k, v in learner.update(rows, rows, masked, measure=True).items()})
-    with_mask, without = measured
-    assert without["L_BC"] == pytest.approx(error) and with_mask["L_BC"] < 0.9 * error
-    assert 0 < with_mask["mask_fraction"] == without["mask_fraction"] < 1
-    assert without["L_A"] == pytest.approx(without["L_O"] + 2 * error)
 
 
 def test_an_update_moves_every_network_and_the_policy_that_is_saved_is_the_one_that_acts():
@@ -266,11 +274,10 @@ def one_target(zeta, reward, **changes):
     return learner.update(rows, None, measure=True)["L_C"].item(), Q, Q2
 
 
-@pytest.mark.parametrize("recipe", ["paper", "robust"])
-def test_only_a_true_end_stops_bootstrapping(recipe):
-    loss, Q, Q2 = one_target(0.0, 3.0, recipe=recipe)
+def test_only_a_true_end_stops_bootstrapping():
+    loss, Q, Q2 = one_target(0.0, 3.0)
     assert abs(Q2) > 1e-3 and loss == pytest.approx((3 + 0.5 * Q2 - Q) ** 2, rel=1e-4)
-    loss, Q, Q2 = one_target(1.0, 3.0, recipe=recipe)
+    loss, Q, Q2 = one_target(1.0, 3.0)
     assert loss == pytest.approx((3 - Q) ** 2, rel=1e-4)
 
 
@@ -288,14 +295,17 @@ def test_clip_target_holds_targets_between_minus_four_and_the_largest_return(tas
 
 @pytest.mark.parametrize("layernorm", [True, False])
 def test_layernorm_sits_after_each_hidden_linear_layer_of_the_critic_only(layernorm):
-    net = ddpg.Learner(complete(hidden_sizes=(8, 12), critic_layernorm=layernorm), 22).net
+    net = ddpg.Learner(complete(hidden_sizes=(8, 12), critic_layernorm=layernorm, twin_critic=True), 22).net
     hidden = ["Linear", "LayerNorm", "ReLU"] if layernorm else ["Linear", "ReLU"]
     assert [type(layer).__name__ for layer in net.q] == 2 * hidden + ["Linear"]
+    assert [type(layer).__name__ for layer in net.q2] == 2 * hidden + ["Linear"]
     assert [type(layer).__name__ for layer in net.u] == 2 * ["Linear", "ReLU"] + ["Linear"]
     assert [p.shape[0] for p in net.u.parameters()] == [8, 8, 12, 12, 4, 4]
     s, a = torch.randn(5, 22), torch.rand(5, 4)
     with torch.no_grad():
         torch.testing.assert_close(net.Q(s, a), net.q(torch.cat((s, a), 1))[:, 0])
+        torch.testing.assert_close(net.Q(s, a, second=True), net.q2(torch.cat((s, a), 1))[:, 0])
+        assert not torch.allclose(net.Q(s, a), net.Q(s, a, second=True), atol=1e-3)  # two draws of weights
         torch.testing.assert_close(net.pi(s), torch.tanh(net.u(s)))
 
 
@@ -397,9 +407,9 @@ BOTH_TASKS = dict(replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=
                   pi_lr=1e-3, q_lr=1e-3, partitions=4, seed=0, device="cpu", data_dir="data/runs")  # fmt: skip
 RECIPES = {
     "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  pretanh_penalty=0, mask_after=0),
+                  twin_critic=False, pretanh_penalty=0, clone_steps=0),
     "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   pretanh_penalty=1e-3, mask_after=20_000),
+                   twin_critic=True, pretanh_penalty=1e-3, clone_steps=10_000),
 }
 
 
@@ -664,18 +674,18 @@ def test_updates_begin_at_update_after_itself_where_a_block_is_due(world, monkey
     assert blocks == [28, 35, 42, 49, 56]
 
 
-@pytest.mark.parametrize("mask_after", [0, 90, 999])
-def test_the_mask_is_used_after_mask_after_steps(world, monkeypatch, mask_after):
-    masks, update = [], ddpg.Learner.update
+@pytest.mark.parametrize("clone_steps", [0, 91, 999])
+def test_the_actor_only_clones_in_the_first_clone_steps(world, monkeypatch, clone_steps):
+    cloning, update = [], ddpg.Learner.update
 
-    def noted(self, rows, rows_demo, masked, *args, **kwargs):
-        masks.append(masked)
-        return update(self, rows, rows_demo, masked, *args, **kwargs)
+    def noted(self, rows, rows_demo, cloning_now=False, *args, **kwargs):
+        cloning.append(cloning_now)
+        return update(self, rows, rows_demo, cloning_now, *args, **kwargs)
 
     monkeypatch.setattr(ddpg.Learner, "update", noted)
     monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: (demo_arrays(), 18))
-    world("a", num_demos=4, lambda_bc=1.0, mask_after=mask_after)
-    assert masks == [t > mask_after for t in range(63, 121, 7) for _ in range(7)]
+    world("a", num_demos=4, lambda_bc=1.0, clone_steps=clone_steps)
+    assert cloning == [t <= clone_steps for t in range(63, 121, 7) for _ in range(7)]
 
 
 @pytest.mark.parametrize("symmetry", ["so2", "none"])

@@ -254,6 +254,9 @@ def test_canonical_has_no_base_angle_is_idempotent_and_the_same_for_every_rotate
     for angle in ANGLES:
         assert difference(gas.canonical(gas.rotate(obs, angle)), out) < 1e-12
     assert difference(gas.canonical(gas.rotate(obs, np.linspace(-PI, PI, 50))), out) < 1e-12
+    for single in (obs.astype(np.float32), torch.from_numpy(obs.astype(np.float32))):
+        for first, value in ((0, 0.0), (4, 0.0), (8, 1.0)):
+            assert bool((gas.canonical(single)[:, first] == value).all())
     # it is a rotation: nothing else is lost
     assert difference(gas.rotate(out, -obs[:, 0]), obs) < 1e-12
 

@@ -475,9 +475,9 @@ def test_empty_file_name_is_bad_input_too(monkeypatch, tmp_path, capsys):
 
 def test_trials_print_success_length_return_and_effort_and_write_nothing(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    run(monkeypatch, "--trials", 3, "--gains", "fast", "--stage", "demo", "--seed", 2)
+    run(monkeypatch, "--trials", 3, "--gains", "fast", "--stage", "test", "--seed", 2)
     out = capsys.readouterr().out
-    demos, steps = record("p2p", 3, "fast", seed=2)
+    demos, steps = record("p2p", 3, "fast", seed=2, stage="test")
     assert "3 episodes" in out and f"{steps} environment steps" in out
     assert f"success {100 * demos['success'].mean():.1f} %" in out
     assert f"{demos['length'][demos['success']].mean():.0f} steps" in out
