@@ -16,6 +16,7 @@ import json
 import math
 import signal
 import sys
+import zlib
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -118,6 +119,8 @@ def complete(flags):
     printed = fill_in(Flags(task=flags.task, recipe=flags.recipe))
     changed = {k: v for k, v in asdict(flags).items() if k not in NOT_A_VARIANT and v != getattr(printed, k)}
     variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
+    if len(variant) > 80:
+        variant = f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
     if flags.name is None:
         flags.name = f"{flags.task}-ddpg-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
         flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
@@ -149,7 +152,7 @@ class ReplayBuffer:
         return self.rows[i].view(batches, -1, self.rows.shape[1])
 
     def state(self):
-        return {"rows": self.rows[: self.filled], "next": self.next}
+        return {"rows": self.rows[: self.filled].clone(), "next": self.next}  # of a view, all would be stored
 
     def load(self, state):
         self.filled, self.next = len(state["rows"]), state["next"]
@@ -487,9 +490,13 @@ def train(flags, variant=""):
         )
         logx.atomic_write(run.folder / "policy.pt", lambda file: torch.save(learner.policy(), file))
 
+    def stop_at_nan(where):
+        logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))
+        print(f"{run.folder}: NaN in {where} at step {loop['t']}; networks saved to nan.pt", file=sys.stderr)
+        raise SystemExit(3)
+
     stopped = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: stopped.append(number))
+    handlers = {number: signal.signal(number, lambda number, frame: stopped.append(number)) for number in STOP_SIGNALS}
     bar = tqdm(total=total_steps, initial=loop["t"], unit="step", disable=flags.quiet, smoothing=0.02, mininterval=1)
     if not flags.quiet:
         print(f"{run.folder}: {total_steps} steps, {loop['demo_env_steps']} of the demonstrator; Q at most "
@@ -502,6 +509,8 @@ def train(flags, variant=""):
             with torch.inference_mode():
                 a = torch.tanh(learner.actor(torch.from_numpy(view(s)))).numpy()
             a = np.clip(a + flags.act_noise * rng.standard_normal(4), -1, 1).astype(np.float32)
+        if not np.all(np.isfinite(a)):
+            stop_at_nan("the action")
         s2, r, terminated, truncated, info = env.step(a)
         B_o.store(view(s), a, r, view(s2), terminated)  # zeta: a timeout is no end to bootstrapping
         s = s2
@@ -532,9 +541,7 @@ def train(flags, variant=""):
             measured = learner.block(B_o, B_d)
             loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
-                logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))
-                print(f"{run.folder}: NaN in a loss at step {t}; networks saved to nan.pt", file=sys.stderr)
-                raise SystemExit(3)
+                stop_at_nan("a loss")
             bar.update(t - bar.n)
 
         # log
@@ -565,9 +572,12 @@ def train(flags, variant=""):
     bar.close()
     env.close()
     eval_env.close()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     return run.folder
 
 
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 TABLE_COLUMNS = ("epoch", "env_steps", "EpRet", "Success", "EpLen", "L_BC", "mask_fraction", "Q_mean", "Q_max",
                  "pretanh_own", "bc_relative_error", "eval_success")  # fmt: skip
 TABLE = "{:>5} {:>9} {:>7} {:>7} {:>6} {:>9} {:>13} {:>7} {:>6} {:>11} {:>17} {:>12}"

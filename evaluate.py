@@ -44,15 +44,15 @@ class Policy:
         self.task = stored["task"]
         self.canonical = stored["symmetry"] == "canonical"
         sizes = stored["sizes"]
+        if (sizes[0], sizes[-1]) != (sum(width for _, width, _ in OBSERVATION[self.task]), 4):
+            raise ValueError(f"sizes {sizes} do not fit task {self.task}")
         layers = []
-        for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
-            layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
-        last = [torch.nn.Tanh()] if stored["output"] == "tanh" else []
-        self.net = torch.nn.Sequential(*layers[:-1])
-        self.net.load_state_dict(stored["weights"])
-        self.net = torch.nn.Sequential(self.net, *last)
-        if sizes[0] != sum(width for _, width, _ in OBSERVATION[self.task]):
-            raise ValueError(f"{sizes[0]} inputs, but task {self.task} has another observation")
+        with torch.device("meta"):  # draws no random numbers: a policy may be made in the middle of a run
+            for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+                layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
+        net = torch.nn.Sequential(*layers[:-1])
+        net.load_state_dict(stored["weights"], assign=True)
+        self.net = torch.nn.Sequential(net, torch.nn.Tanh() if stored["output"] == "tanh" else torch.nn.Identity())
 
     def __call__(self, obs):
         s = gas.canonical(obs) if self.canonical else obs
@@ -65,9 +65,11 @@ def load_policy(run_folder):
     path = Path(run_folder) / "policy.pt"
     stored = logx.load_torch(path)
     try:
+        if not isinstance(stored, dict):
+            raise TypeError(f"holds a {type(stored).__name__}")
         return Policy(stored)
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a policy of ours ({str(error).splitlines()[0]})") from None
+    except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not a policy of ours ({logx.one_line(error)})") from None
 
 
 def trial(env, act, i):

@@ -13,14 +13,15 @@ import csv
 import dataclasses
 import fcntl
 import json
+import math
 import os
-import pickle
 import platform
 import subprocess
 import sys
 import time
 import types
 import typing
+import warnings
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -74,11 +75,11 @@ def check_ranges(flags):
         for x in value if isinstance(value, (tuple, list)) else (value,):
             if x is None or isinstance(x, (bool, str)):
                 continue
-            if x != x or (low is not None and x < low) or (high is not None and x > high):
+            if not math.isfinite(x) or (low is not None and x < low) or (high is not None and x > high):
                 allowed = " and ".join(
                     f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None
                 )
-                fail(f"--{field.name} {x}: must be {allowed or 'a number'}")
+                fail(f"--{field.name} {x}: must be {allowed or 'a finite number'}")
 
 
 def atomic_write(path, write):
@@ -100,27 +101,40 @@ def versions():
         except PackageNotFoundError:
             made_with[package] = "unknown"
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    commit = subprocess.run(git, capture_output=True, text=True)
-    return made_with | {"git_commit": commit.stdout.strip() or "unknown"}
+    try:
+        commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    except OSError:  # no git here
+        commit = ""
+    return made_with | {"git_commit": commit or "unknown"}
 
 
 def load_torch(path):
     """torch.load of tensors and plain types only. Raises ValueError with what is wrong with the file."""
     try:
-        return torch.load(path, weights_only=True, map_location="cpu")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, weights_only=True, map_location="cpu")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError) as error:
-        raise ValueError(f"{path}: not a whole file of tensors ({str(error).splitlines()[0]})") from None
+    except Exception as error:  # garbled bytes end in an exception of any kind
+        raise ValueError(f"{path}: not a whole file of tensors ({one_line(error)})") from None
+
+
+def one_line(error):
+    """An exception as one line."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def is_new(folder, resume):
     """Whether a run in this folder starts from nothing (else: from its checkpoint); exits with 2 if it may not."""
-    if folder.exists() and not folder.is_dir():
-        fail(f"--name {folder.name}: {folder} is a file")
-    if folder.exists() and any(folder.iterdir()) and not resume:
-        fail(f"--name {folder.name}: {folder} exists; go on with --resume, or choose another --name")
-    return not (folder / "checkpoint.pt").exists()
+    try:
+        if folder.exists() and not folder.is_dir():
+            fail(f"--name {folder.name}: {folder} is a file")
+        if folder.exists() and any(folder.iterdir()) and not resume:
+            fail(f"--name {folder.name}: {folder} exists; go on with --resume, or choose another --name")
+        return not (folder / "checkpoint.pt").exists()
+    except OSError as error:
+        fail(f"--name {folder.name}: {folder} cannot be read ({error.strerror})")
 
 
 class Run:
@@ -129,6 +143,11 @@ class Run:
 
     def __init__(self, folder, config, tensorboard=False):
         self.folder = Path(folder)
+        if tensorboard:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError:
+                fail("--tensorboard: the tensorboard package is not installed (pip install tensorboard)")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = open(self.folder / "lock", "w")  # noqa: SIM115 - held until the process ends
@@ -148,7 +167,10 @@ class Run:
         for name, columns in (("episodes", EPISODES), ("progress", PROGRESS)):
             path = self.folder / f"{name}.csv"
             if self.checkpoint:
-                os.truncate(path, self.checkpoint["log_bytes"][name])  # rows after the checkpoint are made again
+                size = self.checkpoint["log_bytes"][name]
+                if not path.exists() or path.stat().st_size < size:
+                    fail(f"--resume: {path} is gone or shorter than its checkpoint says ({size} bytes)")
+                os.truncate(path, size)  # rows after the checkpoint are made again
             else:
                 path.write_text(",".join(columns) + "\n")
             self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
@@ -156,13 +178,7 @@ class Run:
         atomic_write(self.folder / "config.json", lambda file: file.write(text))
         self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
         self._begin = time.monotonic()
-        self._board = None
-        if tensorboard:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError:
-                fail("--tensorboard: the tensorboard package is not installed (pip install tensorboard)")
-            self._board = SummaryWriter(self.folder)
+        self._board = SummaryWriter(self.folder) if tensorboard else None
 
     def _same_run(self, config):
         """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""

@@ -52,13 +52,13 @@ class Paper:
     """ag:d-ease-off, eq:loss_actor, eq:bc_gain and eq:mask_q in plain autograd with two torch.optim.Adam.
 
     Shares nothing with the source but the weights it starts from. The arguments from `layernorm` on are the parts of
-    the robust recipe (clip: the range of targets; penalty: times mean u^2; cloning: the actor only clones, unmasked).
+    the robust recipe (clip: the range of targets).
     """
 
     def __init__(self, learner, obs_dim, hidden, gamma, omega, lambda_bc, pi_lr, q_lr, layernorm=False, clip=None,
-                 normalize=False, twin=False, penalty=0.0, cloning=False):  # fmt: skip
+                 normalize=False):  # fmt: skip
         self.gamma, self.omega, self.lambda_bc = gamma, omega, lambda_bc
-        self.clip, self.normalize, self.penalty, self.cloning = clip, normalize, penalty, cloning
+        self.clip, self.normalize = clip, normalize
 
         def copy_of(source, n_in, n_out, norm):
             layers = []
@@ -69,15 +69,12 @@ class Paper:
             net.load_state_dict({name: w.clone() for name, w in source.state_dict().items()})  # strict
             return net
 
-        critics = ["q", "q2"] if twin else ["q"]
         self.u, self.u_target = (copy_of(nets.u, obs_dim, 4, False) for nets in (learner.net, learner.target))
-        self.qs, self.q_targets = ([copy_of(getattr(nets, name), obs_dim + 4, 1, layernorm) for name in critics]
-                                   for nets in (learner.net, learner.target))  # fmt: skip
-        self.mu, self.nu = list(self.u.parameters()), [p for q in self.qs for p in q.parameters()]
+        self.q, self.q_target = (copy_of(nets.q, obs_dim + 4, 1, layernorm) for nets in (learner.net, learner.target))
+        self.mu, self.nu = list(self.u.parameters()), list(self.q.parameters())
         self.adam_mu, self.adam_nu = torch.optim.Adam(self.mu, lr=pi_lr), torch.optim.Adam(self.nu, lr=q_lr)
         self.pairs = [(self.u, learner.net.u), (self.u_target, learner.target.u)]
-        for mine, nets in ((self.qs, learner.net), (self.q_targets, learner.target)):
-            self.pairs += [(net, getattr(nets, name)) for net, name in zip(mine, critics, strict=True)]
+        self.pairs += [(self.q, learner.net.q), (self.q_target, learner.target.q)]
 
     def update(self, batch, demo):
         """One step. batch: (s, a, r, s2, zeta), demo: (s, a) or None. Returns its figures, floats by name."""
@@ -90,14 +87,11 @@ class Paper:
             return torch.tanh(self.u(s))
 
         with torch.no_grad():
-            a2 = torch.tanh(self.u_target(s2))
-            Q2 = torch.stack([value(q, s2, a2) for q in self.q_targets]).min(dim=0).values
-            y = r + self.gamma * (1 - zeta) * Q2
+            y = r + self.gamma * (1 - zeta) * value(self.q_target, s2, torch.tanh(self.u_target(s2)))
             if self.clip:
                 y = torch.clip(y, self.clip[0], self.clip[1])
-        L_C = sum(torch.sum((y - value(q, s, a)) ** 2) / len(s) for q in self.qs)
-        q = self.qs[0]
-        Q, Q_pi = value(q, s, a), value(q, s, pi(s))
+        Q, Q_pi = value(self.q, s, a), value(self.q, s, pi(s))
+        L_C = torch.sum((y - Q) ** 2) / len(s)
         L_O = -torch.sum(Q_pi) / len(s)
         if self.normalize:
             L_O = L_O / abs(torch.sum(Q_pi) / len(s)).item()
@@ -105,10 +99,9 @@ class Paper:
         if demo is not None:
             s_d, a_d = demo
             a_hat = pi(s_d)
-            M = value(q, s_d, a_hat) < value(q, s_d, a_d)
-            used = torch.ones_like(M) if self.cloning else M
-            L_BC = torch.sum((a_d[used] - a_hat[used]) ** 2) / (4 * len(s_d))
-            L_A = self.lambda_bc * L_BC + (0 if self.cloning else L_O)
+            M = value(self.q, s_d, a_hat) < value(self.q, s_d, a_d)
+            L_BC = torch.sum((a_d[M] - a_hat[M]) ** 2) / (4 * len(s_d))
+            L_A = self.lambda_bc * L_BC + L_O
             figures = {
                 "L_BC": L_BC,
                 "mask_fraction": M.float().mean(),
@@ -117,15 +110,14 @@ class Paper:
             }
         figures |= {"L_O": L_O, "L_C": L_C, "L_A": L_A, "Q_mean": Q.mean(), "Q_max": Q.max()}
         figures |= {"pretanh_own": self.u(s).abs().mean()}
-        descended = L_A + self.penalty * torch.mean(self.u(s) ** 2)
-        self.gradients = [torch.autograd.grad(descended, self.mu, retain_graph=True), torch.autograd.grad(L_C, self.nu)]
+        self.gradients = [torch.autograd.grad(L_A, self.mu, retain_graph=True), torch.autograd.grad(L_C, self.nu)]
         for parameters, gradients in zip((self.mu, self.nu), self.gradients, strict=True):
             for p, g in zip(parameters, gradients, strict=True):
                 p.grad = g
         self.adam_mu.step()
         self.adam_nu.step()
         with torch.no_grad():
-            for target, now in zip([self.u_target, *self.q_targets], [self.u, *self.qs], strict=True):
+            for target, now in ((self.u_target, self.u), (self.q_target, self.q)):
                 for p2, p in zip(target.parameters(), now.parameters(), strict=True):
                     p2.copy_(self.omega * p2 + (1 - self.omega) * p)
         return {name: value.item() for name, value in figures.items()}
@@ -145,13 +137,8 @@ PARTS = {  # flags of the source, and the same in the reimplementation
     "layernorm": (dict(critic_layernorm=True), dict(layernorm=True)),
     "clip": (dict(clip_target=True), dict(clip=True)),
     "normalize": (dict(normalize_q=True), dict(normalize=True)),
-    "twin": (dict(twin_critic=True), dict(twin=True)),
-    "penalty": (dict(pretanh_penalty=0.05), dict(penalty=0.05)),
-    "cloning": (dict(), dict(cloning=True)),
-    "robust": (dict(recipe="robust", pretanh_penalty=0.05),
-               dict(layernorm=True, clip=True, normalize=True, twin=True, penalty=0.05)),
-}  # fmt: skip
-PARTS["robust cloning"] = PARTS["robust"][0], PARTS["robust"][1] | dict(cloning=True)
+    "robust": (dict(recipe="robust"), dict(layernorm=True, clip=True, normalize=True)),
+}
 
 
 @pytest.mark.parametrize("task, part, with_demos", [
@@ -174,7 +161,7 @@ def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(task, part, 
         rows, batch = batch_of(48, obs_dim, generator, scale=8.0)  # some targets are beyond the clip
         rows_demo, (s_d, a_d, *_) = batch_of(30, obs_dim, generator)
         expected = paper.update(batch, (s_d, a_d) if with_demos else None)
-        measured = learner.update(rows, rows_demo if with_demos else None, cloning=paper.cloning, measure=True)
+        measured = learner.update(rows, rows_demo if with_demos else None, measure=True)
         measured = {name: value.item() for name, value in measured.items()}
         for name, value in expected.items():
             assert measured.pop(name) == pytest.approx(value, rel=1e-4, abs=1e-5), name
@@ -295,17 +282,14 @@ def test_clip_target_holds_targets_between_minus_four_and_the_largest_return(tas
 
 @pytest.mark.parametrize("layernorm", [True, False])
 def test_layernorm_sits_after_each_hidden_linear_layer_of_the_critic_only(layernorm):
-    net = ddpg.Learner(complete(hidden_sizes=(8, 12), critic_layernorm=layernorm, twin_critic=True), 22).net
+    net = ddpg.Learner(complete(hidden_sizes=(8, 12), critic_layernorm=layernorm), 22).net
     hidden = ["Linear", "LayerNorm", "ReLU"] if layernorm else ["Linear", "ReLU"]
     assert [type(layer).__name__ for layer in net.q] == 2 * hidden + ["Linear"]
-    assert [type(layer).__name__ for layer in net.q2] == 2 * hidden + ["Linear"]
     assert [type(layer).__name__ for layer in net.u] == 2 * ["Linear", "ReLU"] + ["Linear"]
     assert [p.shape[0] for p in net.u.parameters()] == [8, 8, 12, 12, 4, 4]
     s, a = torch.randn(5, 22), torch.rand(5, 4)
     with torch.no_grad():
         torch.testing.assert_close(net.Q(s, a), net.q(torch.cat((s, a), 1))[:, 0])
-        torch.testing.assert_close(net.Q(s, a, second=True), net.q2(torch.cat((s, a), 1))[:, 0])
-        assert not torch.allclose(net.Q(s, a), net.Q(s, a, second=True), atol=1e-3)  # two draws of weights
         torch.testing.assert_close(net.pi(s), torch.tanh(net.u(s)))
 
 
@@ -406,10 +390,8 @@ DEFAULTS = {  # by hand from tab:reward and the text above it; N, lambda, 5 T, 2
 BOTH_TASKS = dict(replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1, polyak=0.995,
                   pi_lr=1e-3, q_lr=1e-3, partitions=4, seed=0, device="cpu", data_dir="data/runs")  # fmt: skip
 RECIPES = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  twin_critic=False, pretanh_penalty=0, clone_steps=0),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   twin_critic=True, pretanh_penalty=1e-3, clone_steps=10_000),
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
 }
 
 
@@ -672,20 +654,6 @@ def test_updates_begin_at_update_after_itself_where_a_block_is_due(world, monkey
     monkeypatch.setattr(ddpg.Learner, "block", lambda *a, **kw: blocks.append(a[1].filled) or block(*a, **kw))
     world("a", update_after=28, update_every=7, epochs=1, steps_per_epoch=60)
     assert blocks == [28, 35, 42, 49, 56]
-
-
-@pytest.mark.parametrize("clone_steps", [0, 91, 999])
-def test_the_actor_only_clones_in_the_first_clone_steps(world, monkeypatch, clone_steps):
-    cloning, update = [], ddpg.Learner.update
-
-    def noted(self, rows, rows_demo, cloning_now=False, *args, **kwargs):
-        cloning.append(cloning_now)
-        return update(self, rows, rows_demo, cloning_now, *args, **kwargs)
-
-    monkeypatch.setattr(ddpg.Learner, "update", noted)
-    monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: (demo_arrays(), 18))
-    world("a", num_demos=4, lambda_bc=1.0, clone_steps=clone_steps)
-    assert cloning == [t <= clone_steps for t in range(63, 121, 7) for _ in range(7)]
 
 
 @pytest.mark.parametrize("symmetry", ["so2", "none"])

@@ -28,8 +28,8 @@ TINY = ["--hidden_sizes", 16, 16, "--epochs", 6, "--steps_per_epoch", 40, "--max
 TINY += ["--gains", "fast", "--start_steps", 20, "--update_after", 70, "--update_every", 10, "--replay_size", 350]
 TINY += ["--batch_size", 32, "--demo_batch_size", 32, "--eval_every", 0, "--checkpoint_every", 1, "--quiet"]
 AGENTS = {
-    "so2": ["--recipe", "robust", "--clone_steps", 120],  # cloning alone, then the whole update
-    "canonical": ["--recipe", "robust", "--symmetry", "canonical", "--clone_steps", 0],
+    "so2": ["--recipe", "robust"],
+    "canonical": ["--recipe", "robust", "--symmetry", "canonical"],
     "plain": ["--num_demos", "0", "--lambda_bc", "0"],
 }
 EPISODES = "episode,env_steps,return,length,success,collision"
