@@ -124,8 +124,8 @@ def complete(flags):
     if flags.name is None:
         flags.name = f"{flags.task}-ddpg-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
         flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
-    if "/" in flags.name or flags.name in ("", ".", ".."):
-        logx.fail(f"--name {flags.name!r}: must be the name of one folder")
+    if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
+        logx.fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
     if flags.device == "cuda" and not torch.cuda.is_available():
         logx.fail("--device cuda: torch sees no GPU here; use --device cpu")
     return flags, variant
@@ -598,4 +598,7 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:  # before or after the training loop, which saves its state and says so
+        sys.exit(130)

@@ -174,8 +174,9 @@ class Run:
             else:
                 path.write_text(",".join(columns) + "\n")
             self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
-        text = json.dumps(config | {"command": sys.argv, "versions": versions()}, indent=1).encode()
-        atomic_write(self.folder / "config.json", lambda file: file.write(text))
+        if not self.checkpoint or config["epochs"] != json.loads(self.checkpoint["config"])["epochs"]:
+            text = json.dumps(config | {"command": sys.argv, "versions": versions()}, indent=1).encode()
+            atomic_write(self.folder / "config.json", lambda file: file.write(text))
         self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
         self._begin = time.monotonic()
         self._board = SummaryWriter(self.folder) if tensorboard else None
