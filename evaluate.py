@@ -169,13 +169,13 @@ def write_csv(path, rows):
 
 
 def show(task, source, path=None, seed=FIRST_SEED):
-    """Three test trials of an agent into a GIF at `path`, or where it is None in PyBullet's window."""
+    """The first test trials of an agent: six into a GIF at `path`, or three in a window where it is None."""
     mode = dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
     env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True, **mode)
     pid = None if isinstance(source, Path) else pid_demo.PID(env, source)
     act = load_policy(source) if pid is None else lambda s: pid.act()
     if path:
-        pid_demo.film(env, act, path, seed=seed)
+        pid_demo.film(env, act, path, episodes=6, seed=seed)
     else:
         for n in range(3):
             s, _ = env.reset(seed=seed + n)
@@ -196,7 +196,7 @@ def main():
     parser.add_argument("--gains", choices=pid_demo.GAINS, default="authors", help="with --pid")
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
-    parser.add_argument("--gif", metavar="FILE", help="film three trials instead")
+    parser.add_argument("--gif", metavar="FILE", help="film six trials instead")
     parser.add_argument("--watch", action="store_true", help="three trials in PyBullet's window instead")
     flags = parser.parse_args()
     for name in ("trials", "jobs"):
