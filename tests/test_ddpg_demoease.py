@@ -450,6 +450,19 @@ def test_the_default_names_of_runs_that_differ_in_any_setting_differ_and_can_be_
         (tmp_path / name).mkdir()  # also with every flag of them at once: no longer than a file name may be
 
 
+def test_a_variant_is_what_differs_from_the_recipe_beside_the_columns_and_lengths_of_the_tables():
+    def variant(**given):
+        return ddpg.complete(ddpg.Flags(**given))[1]
+
+    for given in (dict(), dict(recipe="robust"), dict(task="pnp", seed=5, num_demos=7, lambda_bc=9.0, symmetry="so2"),
+                  dict(epochs=3, quick=True, eval_every=1, checkpoint_every=1, data_dir="x", name="y"),
+                  dict(gamma=0.99, hidden_sizes=[128, 512, 128], critic_layernorm=False)):  # fmt: skip
+        assert variant(**given) == ""
+    assert variant(gamma=0.9) == variant(gamma=0.9, seed=3, num_demos=0) != variant(gamma=0.8)
+    assert "gamma" in variant(gamma=0.9) and "clip_target" in variant(clip_target=True)
+    assert variant(recipe="robust", clip_target=True) == "" != variant(recipe="robust", clip_target=False)
+
+
 # ---- training loop, on a scripted environment ------------------------------------------------------------------------
 
 

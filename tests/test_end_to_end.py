@@ -278,10 +278,11 @@ def test_a_folder_of_a_run_is_refused_without_resume_and_left_untouched(server, 
     assert "--resume" in process.err and "--name" in process.err and files(folder) == before
 
 
-def test_resuming_a_finished_run_says_so_and_changes_nothing(server, unbroken, tmp_path):
+@pytest.mark.parametrize("flags", [[], ["--epochs", 2]], ids=["as it was", "with fewer epochs"])
+def test_resuming_a_finished_run_says_so_and_changes_nothing(server, unbroken, tmp_path, flags):
     folder = shutil.copytree(unbroken("plain"), tmp_path / "run")
     before = files(folder)
-    process = server.run(*argv_of(folder, *AGENTS["plain"], "--resume"))
+    process = server.run(*argv_of(folder, *AGENTS["plain"], "--resume", *flags))
     assert process.code == 0 and process.err == "" and "finished" in process.out
     assert files(folder) == before
 
