@@ -170,8 +170,8 @@ def test_a_run_of_no_printed_column_is_listed_as_not_in_the_papers_table(tmp_pat
         ("1.0", "")]
 
 
-@pytest.mark.parametrize("config", [{"recipe": "paper"}, {"symmetry": "gas"}, {"epochs": 1}])
-def test_runs_that_differ_in_recipe_symmetry_or_length_are_never_averaged_together(tmp_path, capsys, config):
+@pytest.mark.parametrize("config", [{"recipe": "paper"}, {"symmetry": "gas"}, {"epochs": 1}, {"variant": "gamma=0.9"}])
+def test_runs_that_differ_in_recipe_symmetry_variant_or_length_are_never_averaged_together(tmp_path, capsys, config):
     write_run(tmp_path / "runs/a", [1.0] * 60)
     write_run(tmp_path / "runs/b", [3.0] * 60, **config)
     _, rows = table(capsys)
