@@ -2,7 +2,7 @@
 
     python ddpg_demoease.py --task p2p --quick                                 # a few minutes, to see it learn
     python ddpg_demoease.py --task p2p --recipe robust --epochs 50             # 100,000 steps
-    python ddpg_demoease.py --task p2p --recipe paper                          # the paper's run: 500,000 steps
+    python ddpg_demoease.py --task p2p --recipe paper                          # as printed: 250 epochs, 500,000 steps
     python ddpg_demoease.py --task p2p --num_demos 0 --lambda_bc 0             # plain DDPG
     python ddpg_demoease.py --task p2p --seed 1 --resume                       # goes on where it was stopped
 
@@ -58,7 +58,7 @@ class Flags:
     steps_per_epoch: int | None = flag(None, "5 T", low=1)
     max_ep_len: int | None = flag(None, "T; 400, 500, 800", low=1)
     # the algorithm (tab:reward; start_steps and update_after: ours)
-    update_every: int | None = flag(None, "N_up, steps between blocks of as many updates; 20 on p2p, else T/20", low=1)
+    update_every: int | None = flag(None, "N_up, steps between blocks of as many updates; T/20", low=1)
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T", low=0)
     update_after: int | None = flag(None, "no updates before; T", low=0)
     replay_size: int = flag(1_000_000, "N_o", low=1)
@@ -88,7 +88,7 @@ class Flags:
     tensorboard: bool = flag(False)
 
 
-BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes with P2P-O's schedule
+BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes, 250 epochs (ours)
     "p2p": dict(max_ep_len=400, epochs=250, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
     "p2po": dict(max_ep_len=500, epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
@@ -451,8 +451,6 @@ def train(flags, variant=""):
             B_d = ReplayBuffer(obs_dim, len(state["B_d"]["rows"]))
             B_d.load(state["B_d"])
         torch.set_rng_state(state["torch_rng"])
-        if flags.device == "cuda":
-            torch.cuda.set_rng_state(state["cuda_rng"])
         rng.bit_generator.state = loop["rng"]
         # The unfinished episode is played again: the simulator's state is not enough to go on exactly.
         env.unwrapped.np_random.bit_generator.state = loop["episode_rng"]
@@ -483,7 +481,6 @@ def train(flags, variant=""):
                 "B_o": B_o.state(),
                 "B_d": B_d.state() if B_d else None,
                 "torch_rng": torch.get_rng_state(),
-                "cuda_rng": torch.cuda.get_rng_state() if flags.device == "cuda" else None,
                 "episode_actions": torch.from_numpy(np.array(actions, dtype=np.float32).reshape(-1, 4)),
                 "loop": json.dumps(loop),
             },
@@ -565,7 +562,7 @@ def train(flags, variant=""):
                 bar.write(TABLE.format(*(f"{row.get(c, math.nan):.4g}" for c in TABLE_COLUMNS)))
             if epoch % flags.checkpoint_every == 0 or t == total_steps:
                 save()
-        if stopped:
+        if stopped and t < total_steps:
             save()
             bar.close()
             print(f"{run.folder}: stopped at step {t}, state saved; go on with --resume", file=sys.stderr)

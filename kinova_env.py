@@ -209,7 +209,8 @@ class KinovaEnv(gymnasium.Env):
     | demo | the start of sector k of K, 0.52, 0.42, each joint +- 0.02 rad | in the sector, [0.4, 0.6), [0.35, 0.55) |
 
     The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. Draws that start in
-    collision or at the goal, and P&P cubes that cannot be grasped, are drawn again.
+    collision or at the goal, and P&P cubes that cannot be grasped, are drawn again. On stage "demo" the goals of tasks
+    with a cube lie in the sector's clockwise half, and P&P cubes in the sector.
 
     ## Episode end
     Terminated: success (norm(e) < 0.05, on P&P with the cube grasped), or collision: `info["collision"]` is "self" for
@@ -409,7 +410,7 @@ class KinovaEnv(gymnasium.Env):
 
     def step(self, action):
         a1, a2, a3, a5 = action.tolist() if isinstance(action, np.ndarray) else action
-        if a1 + a2 + a3 + a5 != a1 + a2 + a3 + a5:
+        if a1 != a1 or a2 != a2 or a3 != a3 or a5 != a5:
             raise ValueError(f"action {action!r}: has a NaN")
         v1, v2, v3, v5 = self._velocity_scale
         client = self._client
@@ -491,7 +492,7 @@ class KinovaEnv(gymnasium.Env):
         return np.array(state, dtype=np.float32)
 
     def _collision(self):
-        """ "", "self" or "cube" at the present posture."""
+        """ "", "self" (contacts that the last physics step began with) or "cube" (at the present posture)."""
         client = self._client
         for contact in pybullet.getContactPoints(self._robot, self._robot, physicsClientId=client):
             self._touched = True

@@ -6,8 +6,8 @@
     python pid_demo.py --task p2p --record 100 --out demos.npz      # episodes for ddpg_demoease.py --demos demos.npz
 
 The controller drives joint angles to the inverse kinematics of Cartesian set points; the action is the reference joint
-velocity in the environment's normalised units. Gains: `authors` is the slow controller that reproduces the paper's
-lengths, `fast` reaches in under half the time (see the README for both, measured).
+velocity in the environment's normalised units. Gains: `authors` is the slow controller as seen of the authors (about
+280 steps on P2P), `fast` reaches in under half the time (see the README for both, measured).
 """
 
 import argparse
@@ -36,7 +36,7 @@ class PID:
 
     env: a KinovaEnv or a wrapper of one; a new episode is noticed by itself. gains: a name in GAINS or (K_P, K_D, K_I).
     `act()` returns the action (4,) float32 in [-1, 1]. Where K_I > 0, a joint's integral rests while its action is
-    saturated (anti-windup).
+    saturated (anti-windup). clearance, radius: of the way points, in m.
     """
 
     def __init__(self, env, gains="authors", clearance=CLEARANCE, radius=RADIUS):
@@ -115,7 +115,7 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
             for column, value in zip(rows.values(), (s, a, r, s2, terminated, truncated, n), strict=True):
                 column.append(value)
             s, total, effort, length = s2, total + r, effort + info["effort"], length + 1
-        of_episode = (info.get("partition", 0), info["is_success"], length, total, 50 * effort / length)
+        of_episode = (info.get("partition", -1), info["is_success"], length, total, 50 * effort / length)
         for column, value in zip(episodes.values(), of_episode, strict=True):
             column.append(value)
     width = env.observation_space.shape[0]
@@ -140,6 +140,8 @@ def load_demos(path, task):
         shapes = {"obs": (rows, width), "obs2": (rows, width), "act": (rows, 4)}
         shapes |= dict.fromkeys(("rew", "terminated", "truncated", "episode"), (rows,))
         shapes |= dict.fromkeys(("partition", "success", "length", "return"), (episodes,))
+        if not isinstance(meta["env_steps"], int) or not isinstance(meta["symmetry"], str):
+            raise ValueError("its meta lacks env_steps or symmetry")
         if any(demos[name].shape != shape or not np.all(np.isfinite(demos[name])) for name, shape in shapes.items()):
             raise ValueError("its arrays do not fit together")
     except FileNotFoundError:

@@ -275,10 +275,10 @@ def test_gas_takes_N_over_K_real_episodes_rounded_up_in_partition_0_and_maps_the
 
 
 @pytest.mark.parametrize("stage", ["train", "test"])
-def test_other_stages_are_recorded_in_partition_0_from_their_own_start(stage):
+def test_other_stages_are_recorded_from_their_own_start_in_no_partition(stage):
     demos, _ = record("p2p", 2, gains="fast", seed=0, stage=stage)
     check_arrays(demos, "p2p", 2)
-    assert demos["partition"].tolist() == [0, 0]
+    assert demos["partition"].tolist() == [-1, -1]
     start = demos["obs"][0, 16:19] - demos["obs"][0, 19:22]
     theta, rho, z = {"train": (PI / 4, 0.52, 0.42), "test": (-PI / 4, 0.5, 0.45)}[stage]
     np.testing.assert_allclose(start, cartesian(theta, rho, z), rtol=0, atol=1e-6)
