@@ -174,7 +174,7 @@ class Run:
             else:
                 path.write_text(",".join(columns) + "\n")
             self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
-        if not self.checkpoint or config["epochs"] != json.loads(self.checkpoint["config"])["epochs"]:
+        if not self.checkpoint or config["epochs"] > json.loads(self.checkpoint["config"])["epochs"]:
             text = json.dumps(config | {"command": sys.argv, "versions": versions()}, indent=1).encode()
             atomic_write(self.folder / "config.json", lambda file: file.write(text))
         self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
