@@ -342,8 +342,8 @@ def save(path, columns):
 def damaged(path, at):
     """Some bytes of the file changed."""
     content = bytearray(path.read_bytes())
-    for i in range(300):  # more than one local header of the zip holds, so that data is hit
-        content[at + i] ^= 0x55
+    for i in range(at, min(at + 300, len(content))):  # more than a local header of the zip, so that data is hit
+        content[i] ^= 0x55
     path.write_bytes(bytes(content))
 
 
