@@ -404,11 +404,16 @@ def demonstrations(flags):
         return None, 0
     if flags.demos is None:
         settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
-        return pid_demo.record(flags.task, flags.num_demos, **settings, quiet=flags.quiet)
+        try:
+            return pid_demo.record(flags.task, flags.num_demos, **settings, quiet=flags.quiet)
+        except ValueError as error:
+            logx.fail(f"--{error}")
     try:
         demos, meta = pid_demo.load_demos(flags.demos, flags.task)
     except ValueError as error:
         logx.fail(f"--demos {error}")
+    if "gas" in (flags.symmetry, meta["symmetry"]) and meta["partitions"] != flags.partitions:
+        logx.fail(f"--demos {flags.demos}: of {meta['partitions']} partitions, not --partitions {flags.partitions}")
     if flags.symmetry == "gas" and meta["symmetry"] != "gas":
         demos = gas.aggregate(demos, flags.partitions)
     found = len(demos["length"])

@@ -377,6 +377,11 @@ class KinovaEnv(gymnasium.Env):
             self._place(posture, cube)
             if self._playable(goal, cube):
                 break
+        else:
+            if set(options) <= {"partition"}:
+                raise ValueError(
+                    f"partitions {self.partitions}: too many, no {self.task} demonstration fits in a sector"
+                )
         self.goal = cartesian(*goal).tolist()
         if self._goal_marker is not None:
             pybullet.resetBasePositionAndOrientation(

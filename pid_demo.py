@@ -140,8 +140,8 @@ def load_demos(path, task):
         shapes = {"obs": (rows, width), "obs2": (rows, width), "act": (rows, 4)}
         shapes |= dict.fromkeys(("rew", "terminated", "truncated", "episode"), (rows,))
         shapes |= dict.fromkeys(("partition", "success", "length", "return"), (episodes,))
-        if not isinstance(meta["env_steps"], int) or not isinstance(meta["symmetry"], str):
-            raise ValueError("its meta lacks env_steps or symmetry")
+        if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
+            raise ValueError("its meta lacks env_steps, partitions or symmetry")
         if any(demos[name].shape != shape or not np.all(np.isfinite(demos[name])) for name, shape in shapes.items()):
             raise ValueError("its arrays do not fit together")
     except FileNotFoundError:
@@ -235,7 +235,10 @@ def main():
         return
 
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
-    demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
+    try:
+        demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
+    except ValueError as error:
+        parser.error(f"--{error}")
     won = demos["success"]
     length = f"{demos['length'][won].mean():.0f} steps" if won.any() else "no success"
     print(

@@ -754,8 +754,9 @@ def test_a_row_of_progress_averages_its_own_epoch(world, monkeypatch):
 
 
 def test_the_same_seed_gives_the_same_run_and_another_does_not(plain, world):
-    (one, _), (again, _), (other, _) = plain, world("b"), world("c", seed=4)
+    (one, env), (again, _), (other, other_env) = plain, world("b"), world("c", seed=4)
     assert curves(one) == curves(again)
+    assert not np.array_equal(env.steps[0].s, other_env.steps[0].s)  # the episodes too, not the exploration alone
     assert all(x != y for x, y in zip(curves(one), curves(other), strict=True))
 
 

@@ -6,6 +6,7 @@ The scripts run as processes of their own, forked from one that has already impo
 import csv
 import json
 import os
+import pickle
 import random
 import shutil
 import signal
@@ -443,6 +444,12 @@ def test_every_task_trains_with_every_recipe_and_its_agent_can_be_tested(server,
     assert rows_of(folder / "episodes.csv")[0]["env_steps"] == rows_of(folder / "episodes.csv")[0]["length"]
 
 
+def test_a_policy_that_is_a_pickled_object_is_one_line_of_the_test_study_too(server, tmp_path):
+    (tmp_path / "policy.pt").write_bytes(pickle.dumps(Path(".")))  # torch warns of what it sees before it refuses it
+    done = server.run("evaluate.py", tmp_path)
+    assert done.code == 2 and done.err.count("\n") == 1 and str(tmp_path / "policy.pt") in done.err and not done.out
+
+
 # ---- bad command lines -----------------------------------------------------------------------------------------------
 
 
@@ -495,6 +502,8 @@ BAD += [
     (["--demos", "{material}"], "--demos"),
     (["--demos", "{material}/two.npz", "--num_demos", "3"], "--num_demos"),
     (["--demos", "{material}/two.npz", "--num_demos", "9", "--symmetry", "gas"], "--num_demos"),
+    (["--demos", "{material}/two.npz", "--symmetry", "gas", "--partitions", "3"], "--partitions 3"),
+    (["--task", "pnp", "--partitions", "30", "--num_demos", "2"], "--partitions 30"),
     (["--replay_size", "10"], "--replay_size"),
     (["--demos", "{material}/two.npz", "--replay_size", "10"], "--replay_size"),
     (["--data_dir", "{material}/two.npz"], "--data_dir"),

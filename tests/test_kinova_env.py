@@ -703,6 +703,13 @@ def test_grasp_pays_two_once_and_the_cube_then_moves_with_the_tcp(make):
     assert np.linalg.norm(part(rows[-1][0], "P_o") - part(rows[1][0], "P_o")) > 0.2
 
 
+@pytest.mark.parametrize("options", [None, {"partition": 2}])
+def test_sectors_too_thin_for_any_demonstration_are_a_value_error(make, options):
+    make("pnp", stage="demo", partitions=20).reset(seed=0, options=options)
+    with pytest.raises(ValueError, match="partitions 24"):  # a cube is at least pi/12 from its goal
+        make("pnp", stage="demo", partitions=24).reset(seed=0, options=options)
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_horizon_truncates_and_never_terminates_and_max_episode_steps_moves_it(make, task):
     for settings, horizon in (({}, TASKS[task].horizon), ({"max_episode_steps": 7}, 7)):

@@ -261,7 +261,7 @@ def test_versions_name_the_commit_and_say_dirty_where_a_tracked_file_changed(tmp
     git("commit", "-q", "-m", "m")
     commit = git("rev-parse", "HEAD").strip()
     assert logx.versions()["git_commit"] == commit
-    git("tag", "v1")
+    git("tag", "-a", "v1", "-m", "m")
     assert logx.versions()["git_commit"] == commit  # not the tag's name
     (tmp_path / "logx.py").write_text("2\n")
     assert logx.versions()["git_commit"] == f"{commit}-dirty"

@@ -331,7 +331,7 @@ def test_record_replaces_an_older_file(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def good():
     demos, _ = record("p2p", 2, gains="fast", seed=0)
-    return demos | {"meta": np.array(json.dumps({"task": "p2p", "symmetry": "none", "env_steps": 12}))}
+    return demos | {"meta": np.array(json.dumps({"task": "p2p", "symmetry": "none", "env_steps": 12, "partitions": 4}))}
 
 
 def save(path, columns):
@@ -442,6 +442,7 @@ BAD = [  # arguments ({} is an empty folder), what the line names
     ("--trials 1 --symmetry so2", "so2"),
     ("--trials 1 --symmetry gas --stage test", "--stage"),
     ("--trials 1 --partitions 0", "--partitions 0"),
+    ("--trials 1 --partitions 40 --task pnp", "--partitions 40"),
     ("--trials 1 --seed -1", "--seed -1"),
     ("--trials 1 --speed 2", "--speed"),
     ("--watch", "DISPLAY"),
