@@ -6,10 +6,10 @@
     python ddpg_demoease.py --task p2p --num_demos 0 --lambda_bc 0             # plain DDPG
     python ddpg_demoease.py --task p2p --seed 1 --resume                       # goes on where it was stopped
 
-Two recipes. `paper` is the algorithm as printed. `robust` adds four parts, each a flag of its own: LayerNorm in the
-critic, Bellman targets clipped to possible returns, L_O divided by |mean Q|, and a symmetry for the networks; its
-demonstrations come from the faster PID gains. 100,000 robust P2P steps (15 to 50 minutes on one core) gave 99.4 and
-100.0 % test success with seeds 0 and 1; README.md has every measured figure and the list of differences from the paper.
+Two recipes. `paper` is the algorithm as printed. `robust` adds five parts, each a flag of its own: LayerNorm in the
+critic, Bellman targets clipped to possible returns, L_O divided by |mean Q|, learning rates that fall to 0, and a
+symmetry for the networks; its demonstrations come from the faster PID gains. README.md has every measured figure, with
+the minutes it took, and the list of differences from the paper.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
 
@@ -75,6 +75,7 @@ class Flags:
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
+    lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the run")
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -94,9 +95,11 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes, 250 epo
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
-}
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
+                  lr_decay=False),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
+                   lr_decay=True),
+}  # fmt: skip
 QUICK = dict(recipe="robust", epochs=15)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
@@ -307,10 +310,16 @@ class Learner:
         self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
 
-    def block(self, B_o, B_d):
-        """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name."""
+    def block(self, B_o, B_d, left=1.0):
+        """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name.
+
+        left: the fraction of the run that is still to come, for lr_decay.
+        """
         f = self.flags
         n = f.update_every
+        if f.lr_decay:
+            for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
+                group["lr"] = lr * left
         rows, rows_demo = B_o.sample(f.batch_size, n), B_d.sample(f.demo_batch_size, n) if B_d else None
         if f.symmetry == "so2":  # each transition turned by an angle of its own
             rows = turn(rows, self.widths)
@@ -541,7 +550,7 @@ def train(flags, variant=""):
 
         # update
         if t >= flags.update_after and t % flags.update_every == 0:
-            measured = learner.block(B_o, B_d)
+            measured = learner.block(B_o, B_d, 1 - t / total_steps)
             loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
                 stop_at_nan("a loss")

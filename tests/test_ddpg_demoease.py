@@ -209,6 +209,15 @@ def test_a_saved_learner_goes_on_bit_for_bit():
     assert torch.equal(learner.net.flat, other.net.flat) and torch.equal(learner.target.flat, other.target.flat)
 
 
+@pytest.mark.parametrize("decay, factor", [(True, 0.25), (False, 1.0)])
+def test_lr_decay_scales_both_learning_rates_by_the_fraction_of_the_run_still_to_come(decay, factor):
+    flags = complete(hidden_sizes=(8,), pi_lr=2e-3, q_lr=5e-3, lr_decay=decay, update_every=2, symmetry="none")
+    learner, buffer = ddpg.Learner(flags, 22), ddpg.ReplayBuffer(22, 10)
+    buffer.load({"rows": batch_of(10, 22, torch.Generator().manual_seed(0))[0], "next": 0})
+    learner.block(buffer, buffer, left=0.25)
+    assert [group["lr"] for group in learner.optimizer.param_groups] == [2e-3 * factor, 5e-3 * factor]
+
+
 # ---- losses ----------------------------------------------------------------------------------------------------------
 
 
@@ -390,9 +399,11 @@ DEFAULTS = {  # by hand from tab:reward and the text above it; N, lambda, 5 T, 2
 BOTH_TASKS = dict(replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1, polyak=0.995,
                   pi_lr=1e-3, q_lr=1e-3, partitions=4, seed=0, device="cpu", data_dir="data/runs")  # fmt: skip
 RECIPES = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True),
-}
+    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
+                  lr_decay=False),
+    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
+                   lr_decay=True),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("recipe", [None, "paper", "robust"])
