@@ -6,10 +6,10 @@
     python ddpg_demoease.py --task p2p --num_demos 0 --lambda_bc 0             # plain DDPG
     python ddpg_demoease.py --task p2p --seed 1 --resume                       # goes on where it was stopped
 
-Two recipes. `paper` is the algorithm as printed. `robust` adds five parts, each a flag of its own: LayerNorm in the
-critic, Bellman targets clipped to possible returns, L_O divided by |mean Q|, learning rates that fall to 0, and a
-symmetry for the networks; its demonstrations come from the faster PID gains. README.md has every measured figure, with
-the minutes it took, and the list of differences from the paper.
+Two recipes. `paper` is the algorithm as printed. `robust` adds six parts, each a flag of its own: LayerNorm in the
+critic, Bellman targets clipped to possible returns, faster target networks, L_O divided by |mean Q|, learning rates
+that fall to 0, and a symmetry for the networks; its demonstrations come from the faster PID gains. README.md has every
+measured figure, with the minutes it took, and the list of differences from the paper.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
 
@@ -66,7 +66,7 @@ class Flags:
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, low=0, high=1)
     act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
-    polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
+    polyak: float | None = flag(None, "omega, target update coefficient; 0.995, robust: 0.98", low=0, high=1)
     pi_lr: float = flag(1e-3, "alpha_mu", low=0)
     q_lr: float = flag(1e-3, "alpha_nu", low=0)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128 on p2p, 256 1024 256 on p2po, 512 512 256 on pnp",
@@ -96,11 +96,11 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes, 250 epo
 }
 BY_RECIPE = {
     "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  lr_decay=False),
+                  lr_decay=False, polyak=0.995),
     "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   lr_decay=True),
+                   lr_decay=True, polyak=0.98),
 }  # fmt: skip
-QUICK = dict(recipe="robust", epochs=15)
+QUICK = dict(recipe="robust", epochs=15, lr_decay=False)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
 NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
@@ -120,7 +120,7 @@ def complete(flags):
     flags = fill_in(flags)
     flags.hidden_sizes = tuple(flags.hidden_sizes)
     logx.check_ranges(flags)
-    printed = fill_in(Flags(task=flags.task, recipe=flags.recipe))
+    printed = fill_in(Flags(task=flags.task, recipe=flags.recipe, quick=flags.quick))
     changed = {k: v for k, v in asdict(flags).items() if k not in NOT_A_VARIANT and v != getattr(printed, k)}
     variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
     if len(variant) > 80:
@@ -429,7 +429,8 @@ def demonstrations(flags):
     if found < flags.num_demos:
         logx.fail(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     first = demos["episode"] < flags.num_demos
-    return {name: demos[name][first] for name in ("obs", "act", "rew", "obs2", "terminated")}, meta["env_steps"]
+    columns = {"obs", "act", "executed", "rew", "obs2", "terminated"} & set(demos)
+    return {name: demos[name][first] for name in columns}, meta["env_steps"]
 
 
 def train(flags, variant=""):
@@ -476,10 +477,10 @@ def train(flags, variant=""):
         if demos:
             B_d = ReplayBuffer(obs_dim, len(demos["rew"]))
             columns = ("obs", "act", "rew", "obs2", "terminated")
-            for s, a, r, s2, terminated in zip(*(demos[name] for name in columns), strict=True):
-                transition = (view(s), a, r, view(s2), terminated)
-                B_d.store(*transition)
-                B_o.store(*transition)  # both buffers
+            done = demos.get("executed", demos["act"])  # not what the demonstrator asked for, where noise was added
+            for s, a, r, s2, terminated, a_done in zip(*(demos[name] for name in columns), done, strict=True):
+                B_d.store(view(s), a, r, view(s2), terminated)
+                B_o.store(view(s), a_done, r, view(s2), terminated)  # both buffers
         loop = {"t": 0, "episodes": 0, "demo_env_steps": demo_env_steps, "ep_ret": 0.0, "epoch_log": []}
         loop["epoch_episodes"] = []
         env.unwrapped.reset(seed=flags.seed)

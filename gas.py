@@ -111,7 +111,7 @@ def aggregate(demos, K=4, num_demos=None):
     episode: partition, success, length, return); other partitions' episodes are left out. Returns the same arrays
     with K times the episodes, of which the first `num_demos` are kept. Rewards and ends do not change under phi.
     """
-    rows = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")
+    rows = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode", "executed")
     images = {name: [] for name in demos}
     sources = np.flatnonzero(demos["partition"] == 0)
     total = len(sources) * K if num_demos is None else min(num_demos, len(sources) * K)
@@ -121,7 +121,8 @@ def aggregate(demos, K=4, num_demos=None):
         for name in set(demos) - {"partition"}:
             images[name].append(demos[name][mine] if name in rows else demos[name][source : source + 1])
         images["obs"][-1], images["obs2"][-1] = phi(images["obs"][-1], k, K), phi(images["obs2"][-1], k, K)
-        images["act"][-1] = psi(images["act"][-1], k, K)
+        for name in {"act", "executed"} & set(demos):
+            images[name][-1] = psi(images[name][-1], k, K)
         images["episode"][-1] = np.full(mine.sum(), n, dtype=demos["episode"].dtype)
         images["partition"].append(np.full(1, k, dtype=demos["partition"].dtype))
     return {name: np.concatenate(parts) if parts else demos[name][:0] for name, parts in images.items()}

@@ -25,9 +25,10 @@ from tqdm import tqdm
 import gas
 from kinova_env import OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
 
-CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it on P&P
+CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it (at most) on P&P
 RETRACT = 0.35  # m, radius to which it draws back before it rises beside a cube on P2P-O
 RADIUS = 0.05  # m, within which a way point counts as reached
+NOISE_KEPT = 0.9  # of the noise of one step in the next, 20 ms later
 GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
 
 
@@ -36,13 +37,13 @@ class PID:
 
     env: a KinovaEnv or a wrapper of one; a new episode is noticed by itself. gains: a name in GAINS or (K_P, K_D, K_I).
     `act()` returns the action (4,) float32 in [-1, 1]. Where K_I > 0, a joint's integral rests while its action is
-    saturated (anti-windup). clearance, radius: of the way points, in m.
+    saturated (anti-windup). clearance, radius, retract: of the way points, in m.
     """
 
-    def __init__(self, env, gains="authors", clearance=CLEARANCE, radius=RADIUS):
+    def __init__(self, env, gains="authors", clearance=CLEARANCE, radius=RADIUS, retract=RETRACT):
         self.env = env.unwrapped
         self.K_P, self.K_D, self.K_I = GAINS[gains] if isinstance(gains, str) else gains
-        self.clearance, self.radius = clearance, radius
+        self.clearance, self.radius, self.retract = clearance, radius, retract
         self._episode = None
 
     def _plan(self):
@@ -55,23 +56,33 @@ class PID:
             cross = ("cross", postures((*env.goal[:2], height)))
             if math.dist((x, y), env.cube[:2]) > self.clearance:
                 return [("rise", postures((x, y, height))), cross, goal]
-            x, y = x * RETRACT / math.hypot(x, y), y * RETRACT / math.hypot(x, y)  # no room: draw back first
+            x, y = x * self.retract / math.hypot(x, y), y * self.retract / math.hypot(x, y)  # no room: draw back
             return [("retract", postures((x, y, z))), ("rise", postures((x, y, height))), cross, goal]
-        if env.row.cube == "object":  # approach along the cube's horizontal axis, grasp, carry
-            x, y, z = env.cube
-            back = 1 - self.clearance / math.hypot(x, y)
-            grasp = grasp_postures(env.cube)
-            approach = grasp_postures((back * x, back * y, z))
-            return [("approach", approach), ("grasp", grasp), goal]
+        if env.row.cube == "object":
+            return [("grasp", self._approach()), goal]
         return [goal]
 
+    def _approach(self):
+        """Postures that grasp on the cube's horizontal axis, as far before the cube as the TCP is beside that axis.
+
+        A function of the state, not of what was reached before: a clone of the demonstrations can follow it.
+        """
+        (x, y, z), (x_e, y_e, z_e) = self.env.cube, self.env.tcp
+        rho = math.hypot(x, y)
+        back = 1 - min(self.clearance, math.hypot((x_e * y - y_e * x) / rho, z_e - z)) / rho
+        found = grasp_postures((back * x, back * y, z))
+        return found if len(found) else grasp_postures(self.env.cube)
+
+    def _nearest(self, found):
+        """Of postures (M, 4) the one nearest to the present."""
+        q = np.array(self.env.q)
+        return found[np.argmin(wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1))]
+
     def _next(self):
-        """Takes the next set point: of its postures the one nearest to the present."""
+        """Takes the next set point."""
         self._name, found = self._points.pop(0)
         if len(found):
-            q = np.array(self.env.q)
-            error = wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1)
-            self._q_sp = found[np.argmin(error)]
+            self._q_sp = self._nearest(found)
             self._at = np.array(tcp(self._q_sp))
             self._integral = np.zeros(4)
         else:  # out of reach: a way point is left out (the goal never is)
@@ -85,6 +96,8 @@ class PID:
             self.env.grasped if self._name == "grasp" else math.dist(self._at, self.env.tcp) < self.radius
         ):
             self._next()
+        if self._name == "grasp":
+            self._q_sp = self._nearest(self._approach())
         q_tilde = self._q_sp - self.env.q
         q_tilde[0] = wrap(q_tilde[0])  # joint 1 turns without end: the shortest way round
         integral = self._integral + q_tilde * TIME_STEP
@@ -93,26 +106,36 @@ class PID:
         return np.clip(a, -1, 1).astype(np.float32)
 
 
-def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="none", stage="demo", quiet=True):
-    """Demonstration episodes (`sec:demo`), failed ones included.
+def record(
+    task, num_demos, gains="authors", seed=0, partitions=4, symmetry="none", stage="demo", quiet=True, noise=0.0, **way
+):
+    """Demonstration episodes (`sec:demo`), failed ones included. way: the PID's clearance, radius and retract, in m.
+
+    noise: standard deviation of noise on the actions, correlated over some 0.2 s (ours, after Laskey et al., DART,
+    2017): states beside the demonstrator's path, with the action that leads back to it. `act` holds what the controller
+    asked for, and `executed` (there only with noise) what was done.
 
     symmetry "gas": ceil(num_demos / partitions) real episodes in partition 0, each mapped to the others, the surplus
     dropped; any other: num_demos real episodes in uniformly drawn partitions. Returns (demos, env_steps): the arrays of
     DESIGN's demonstration file, and how many steps of the environment they took.
     """
     env = gymnasium.make(TASKS[task].env_id, stage=stage, partitions=partitions, disable_env_checker=True)
-    pid = PID(env, gains)
-    rows = {name: [] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")}
+    pid, rng = PID(env, gains, **way), np.random.default_rng((seed, 1))
+    rows = {name: [] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode", "executed")}
     episodes = {name: [] for name in ("partition", "success", "length", "return", "effort")}
     real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
     env.reset(seed=seed)
     for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
         s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
         total, effort, length, terminated, truncated = 0.0, 0.0, 0, False, False
+        drift = np.zeros(4)
         while not (terminated or truncated):
-            a = pid.act()
-            s2, r, terminated, truncated, info = env.step(a)
-            for column, value in zip(rows.values(), (s, a, r, s2, terminated, truncated, n), strict=True):
+            a = executed = pid.act()
+            if noise:
+                drift = NOISE_KEPT * drift + math.sqrt(1 - NOISE_KEPT**2) * noise * rng.standard_normal(4)
+                executed = np.clip(a + drift, -1, 1).astype(np.float32)
+            s2, r, terminated, truncated, info = env.step(executed)
+            for column, value in zip(rows.values(), (s, a, r, s2, terminated, truncated, n, executed), strict=True):
                 column.append(value)
             s, total, effort, length = s2, total + r, effort + info["effort"], length + 1
         of_episode = (info.get("partition", -1), info["is_success"], length, total, 50 * effort / length)
@@ -120,11 +143,13 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
             column.append(value)
     width = env.observation_space.shape[0]
     env.close()
-    dtypes = dict(obs="f4", act="f4", rew="f8", obs2="f4", terminated="?", truncated="?", episode="i8")
+    dtypes = dict(obs="f4", act="f4", rew="f8", obs2="f4", terminated="?", truncated="?", episode="i8", executed="f4")
     dtypes |= {"partition": "i8", "success": "?", "length": "i8", "return": "f8", "effort": "f8"}
     demos = {name: np.array(column, dtype=dtypes[name]) for name, column in (rows | episodes).items()}
-    for name, columns in (("obs", width), ("obs2", width), ("act", 4)):
+    for name, columns in (("obs", width), ("obs2", width), ("act", 4), ("executed", 4)):
         demos[name] = demos[name].reshape(-1, columns)  # also where there is no row
+    if not noise:
+        del demos["executed"]
     steps = len(demos["rew"])
     return (gas.aggregate(demos, partitions, num_demos) if symmetry == "gas" else demos), steps
 
@@ -140,6 +165,7 @@ def load_demos(path, task):
         shapes = {"obs": (rows, width), "obs2": (rows, width), "act": (rows, 4)}
         shapes |= dict.fromkeys(("rew", "terminated", "truncated", "episode"), (rows,))
         shapes |= dict.fromkeys(("partition", "success", "length", "return"), (episodes,))
+        shapes |= {"executed": (rows, 4)} if "executed" in demos else {}
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
         if any(demos[name].shape != shape or not np.all(np.isfinite(demos[name])) for name, shape in shapes.items()):
@@ -189,6 +215,11 @@ def main():
     parser.add_argument("--gains", choices=GAINS, default="authors")
     for name, i in (("K_P", 0), ("K_D", 1), ("K_I", 2)):
         parser.add_argument(f"--{name}", type=float, help=f"instead of that of --gains ({GAINS['authors'][i]})")
+    for name, value, what in (("clearance", CLEARANCE, "of way points above the cube (P2P-O), before it (P&P)"),
+                              ("retract", RETRACT, "radius to draw back to where a rise would meet the cube (P2P-O)"),
+                              ("radius", RADIUS, "within which a way point counts as reached")):  # fmt: skip
+        parser.add_argument(f"--{name}", type=float, default=value, metavar="M", help=f"{what}, in m ({value})")
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of noise on recorded actions")
     parser.add_argument("--stage", choices=STAGES, default="demo")
     parser.add_argument("--symmetry", choices=("none", "gas"), default="none", help="gas: record one partition, map it")
     parser.add_argument("--partitions", type=int, default=4, metavar="K")
@@ -213,6 +244,10 @@ def main():
     ]
     if min(gains) < 0 or not np.all(np.isfinite(gains)):
         parser.error(f"--K_P --K_D --K_I {gains}: must be finite and not negative")
+    for name, low, high in (("clearance", 0, 0.5), ("retract", 0.1, 1), ("radius", 0.001, 0.5), ("noise", 0, 10)):
+        if not low <= getattr(flags, name) <= high:
+            parser.error(f"--{name} {getattr(flags, name)}: must be at least {low} and at most {high}")
+    way = {name: getattr(flags, name) for name in ("clearance", "radius", "retract")}
 
     if flags.watch or flags.gif:
         mode = "human" if flags.watch else "rgb_array"
@@ -222,7 +257,7 @@ def main():
                                  render_mode=mode, **size)  # fmt: skip
         except ValueError as error:
             parser.error(f"--watch: {error}")
-        pid = PID(env, gains)
+        pid = PID(env, gains, **way)
         if flags.gif:
             film(env, lambda s: pid.act(), flags.gif, seed=flags.seed)
             print(f"wrote {flags.gif}")
@@ -235,6 +270,7 @@ def main():
         return
 
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+    settings |= dict(noise=flags.noise, **way)
     try:
         demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
     except ValueError as error:
