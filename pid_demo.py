@@ -33,7 +33,8 @@ GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_
 
 
 class PID:
-    """a_t = K_P q~ + K_I integral(q~) + K_D dq~/dt (`eq:pid`), q~ = q_sp - q in rad, for all four joints.
+    """a_t = K_P q~ + K_I integral(q~) + K_D dq~/dt (`eq:pid`), q~ = q_sp - q in rad, for all four joints; dq~/dt is
+    taken as -dq/dt, the set point at rest.
 
     env: a KinovaEnv or a wrapper of one; a new episode is noticed by itself. gains: a name in GAINS or (K_P, K_D, K_I).
     `act()` returns the action (4,) float32 in [-1, 1]. Where K_I > 0, a joint's integral rests while its action is
@@ -69,9 +70,12 @@ class PID:
         """
         (x, y, z), (x_e, y_e, z_e) = self.env.cube, self.env.tcp
         rho = math.hypot(x, y)
-        back = 1 - min(self.clearance, math.hypot((x_e * y - y_e * x) / rho, z_e - z)) / rho
-        found = grasp_postures((back * x, back * y, z))
-        return found if len(found) else grasp_postures(self.env.cube)
+        ahead = x_e * x + y_e * y > 0  # else the arm has yet to turn round
+        beside = math.hypot((x_e * y - y_e * x) / rho, z_e - z) if ahead else math.inf
+        for back in np.linspace(min(self.clearance, beside, 0.9 * rho), 0, 6):  # out of reach: less far back
+            found = grasp_postures(((1 - back / rho) * x, (1 - back / rho) * y, z))
+            if len(found):
+                return found
 
     def _nearest(self, found):
         """Of postures (M, 4) the one nearest to the present."""
@@ -280,7 +284,7 @@ def main():
     print(
         f"{flags.task} {flags.stage}, K_P K_D K_I = {gains}: {len(won)} episodes, {steps} environment steps\n"
         f"success {100 * won.mean():.1f} %, length of the successful {length}, return {demos['return'].mean():.2f}, "
-        f"effort {demos['effort'].mean():.1f} %, mean |a| {np.abs(demos['act']).mean():.3f}"
+        f"effort {demos['effort'].mean():.1f} %, mean |a| {np.abs(demos.get('executed', demos['act'])).mean():.3f}"
     )
     if flags.record:
         meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))

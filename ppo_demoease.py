@@ -48,7 +48,7 @@ class Flags:
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings")
     seed: int = flag(0, low=0, high=2**32 - 1)
     # length (tab:reward2)
-    epochs: int = flag(50, "N_ep", low=1)
+    epochs: int | None = flag(None, "N_ep; 50", low=1)
     steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1)
     max_ep_len: int | None = flag(None, "T; 400, 500, 800", low=1)
     # the algorithm (tab:reward2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
@@ -61,7 +61,7 @@ class Flags:
     lam: float = flag(0.97, "gamma^GAE, of the advantage estimates", low=0, high=1)
     clip_ratio: float = flag(0.2, "epsilon", low=0)
     target_kl: float = flag(0.02, "largest D_KL from the policy that acted, on its own samples", low=0)
-    pi_lr: float = flag(3e-4, "of the actor", low=0)
+    pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2")
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128 on p2p, 256 1024 256 on p2po, 512 512 256 on pnp",
@@ -97,10 +97,10 @@ BY_TASK = {  # tab:reward, tab:reward2
     "pnp": dict(max_ep_len=800, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, log_std=-0.5, clone_iters=0,
-                  demo_noise=0.0, demos_in_B_o=True,
-                  mask="reward", after_kl="none", normalize_obs=False, clip_value=False),
-    "robust": dict(symmetry="canonical", gains="fast", train_iters=80, demo_batch_size=256, log_std=-2.0,
+    "paper": dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, log_std=-0.5, pi_lr=3e-4,
+                  demo_noise=0.0, demos_in_B_o=True, clone_iters=0, mask="reward", after_kl="none",
+                  normalize_obs=False, clip_value=False),
+    "robust": dict(symmetry="canonical", gains="fast", train_iters=80, demo_batch_size=256, log_std=-2.0, pi_lr=3e-6,
                    demo_noise=0.2, demos_in_B_o=False, clone_iters=4000, mask="none", after_kl="critic",
                    normalize_obs=True, clip_value=True),
 }  # fmt: skip
@@ -113,7 +113,8 @@ NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "qu
 def fill_in(flags):
     """The flags with what the task and the recipe decide in place of None."""
     recipe = flags.recipe or ("robust" if flags.quick else "paper")
-    defaults = BY_TASK[flags.task] | BY_RECIPE[recipe] | {"recipe": recipe}
+    defaults = {"epochs": 50} | BY_TASK[flags.task] | BY_RECIPE[recipe] | (QUICK if flags.quick else {})
+    defaults["recipe"] = recipe
     N = defaults["num_demos"] if flags.num_demos is None else flags.num_demos
     defaults["demos_per_epoch"] = max(1, N if recipe == "robust" else -(-N // 5))
     return replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
@@ -284,7 +285,7 @@ class Learner:
     def normalize(self, B):
         s = B.rows[: B.filled, : self.widths[0]]
         self.net.s_mean.copy_(s.mean(0))
-        self.net.s_std.copy_(s.std(0).clamp(min=1e-2))
+        self.net.s_std.copy_(s.std(0).clamp(min=0.2))  # more would blow up what the demonstrations hardly show
         self.act_with_these()
 
     def act_with_these(self):
@@ -318,7 +319,7 @@ class Learner:
         """The N_up updates of an epoch (B_d None: no cloning). Returns their mean measurements, floats by name."""
         f, net = self.flags, self.net
         rows = B_o.rows[: B_o.filled]
-        if f.symmetry == "so2":  # each trajectory turned by an angle of its own
+        if f.symmetry == "so2":  # each trajectory turned by an angle of its own, as if it had been acted there
             trajectory = rows[:, -2].cumsum(0).long().roll(1)
             trajectory[0] = 0
             rows = turn(rows, self.widths, 2 * math.pi * torch.rand(int(trajectory[-1]) + 1)[trajectory])
@@ -333,7 +334,7 @@ class Learner:
         A = advantages(r, end, V, last_V, f.gamma, f.lam).to(f.device)
         measured, learn_O = [], True
         for _ in range(f.train_iters):
-            i = torch.randint(len(s), (min(f.batch_size, len(s)),), device=f.device)
+            i = torch.randint(len(s), (min(f.batch_size, len(s)),)).to(f.device)
             mu = net.mu(s[i])
             mine = own[i] > 0
             with torch.no_grad():
@@ -356,15 +357,17 @@ class Learner:
                     bc = ((mu_demo - a_demo) ** 2).sum() / (a_demo**2).sum()
                 L_BC = loss_BC(a_demo, mu_demo, M)
                 L_A = loss_A(L_O, L_BC, f.lambda_bc)
+            if not learn_O and f.after_kl == "critic":
+                L_A = L_A.new_zeros(())
             self.optimizer.zero_grad()
-            (L_A + L_C if learn_O or f.after_kl == "all" else L_C).backward()
+            (L_A + L_C).backward()  # a net without a gradient rests
             self.optimizer.step()
             measured.append(
                 {
                     "L_O": L_O.detach() if learn_O else L_O.new_full((), math.nan),
                     "L_BC": L_BC.detach(),
                     "L_C": L_C.detach(),
-                    "L_A": L_A.detach(),
+                    "L_A": L_A.detach() if L_A.requires_grad else L_A.new_full((), math.nan),
                     "mask_fraction": M.mean(),
                     "Q_mean": V_s.detach().mean(),
                     "Q_max": V_s.detach().max(),
@@ -484,6 +487,7 @@ def train(flags, variant=""):
         actions = []
     # The demonstrations lie in B_d from the start, and are "filled" as the epochs open with them.
     ends = [0, *(1 + torch.nonzero(demo_rows[:, -2]).flatten()).tolist()]
+    # Nothing follows a demonstration's end, be it a timeout: there is no V yet when it is recorded.
     R_demo = rewards_to_go(demo_rows[:, obs_dim + 4], demo_rows[:, -2], torch.zeros(len(demo_rows)), flags.gamma)
     B_o, B_d = TrajectoryBuffer(obs_dim, flags.steps_per_epoch + len(demo_rows)), TrajectoryBuffer(obs_dim, 0)
     B_d.rows, B_d.filled = demo_rows, ends[loop["demos"]]
@@ -570,8 +574,8 @@ def train(flags, variant=""):
         if cut:
             measured = learner.epoch(B_o, B_d if B_d.filled else None, R_demo)
             B_o.filled = 0
-            if not math.isfinite(measured.get("L_A", 0) + measured.get("L_C", 0)):
-                stop_at_nan("a loss")
+            if not all(torch.isfinite(p).all() for p in learner.net.parameters()):
+                stop_at_nan("the networks")
             epoch = t // flags.steps_per_epoch
             row = {"epoch": epoch, "env_steps": t, "demo_env_steps": loop["demo_env_steps"]}
             if loop["epoch_episodes"]:

@@ -1,4 +1,4 @@
-"""ddpg_demoease.py as a user runs it: whole runs, killed and resumed ones, run folders, exit codes, bad command lines.
+"""Both algorithm scripts as a user runs them: whole runs, killed and resumed ones, folders, exit codes, bad input.
 
 The scripts run as processes of their own, forked from one that has already imported torch (ten times faster).
 """
@@ -22,17 +22,38 @@ import torch
 
 import ddpg_demoease as ddpg
 import pid_demo
+import ppo_demoease as ppo
 
 ROOT = Path(ddpg.__file__).parent
 EPOCH, STEPS = 40, 240
 TINY = ["--hidden_sizes", 16, 16, "--epochs", 6, "--steps_per_epoch", 40, "--max_ep_len", 28, "--num_demos", 2]
 TINY += ["--gains", "fast", "--start_steps", 20, "--update_after", 70, "--update_every", 10, "--replay_size", 350]
 TINY += ["--batch_size", 32, "--demo_batch_size", 32, "--eval_every", 0, "--checkpoint_every", 1, "--quiet"]
+TINY_PPO = ["--hidden_sizes", 16, 16, "--epochs", 6, "--steps_per_epoch", 40, "--max_ep_len", 28, "--num_demos", 4]
+TINY_PPO += ["--gains", "fast", "--train_iters", 3, "--batch_size", 32, "--demo_batch_size", 32, "--eval_every", 0]
+TINY_PPO += ["--checkpoint_every", 1, "--quiet"]
 AGENTS = {
     "so2": ["--recipe", "robust"],
     "canonical": ["--recipe", "robust", "--symmetry", "canonical"],
     "plain": ["--num_demos", "0", "--lambda_bc", "0"],
+    "p2po": ["--task", "p2po", "--recipe", "robust", "--act_noise", 2],
+    "ppo paper": ["--task", "pnp", "--demos_per_epoch", 1],
+    "ppo robust": ["--task", "pnp", "--recipe", "robust", "--clone_iters", 20],
+    "ppo so2": ["--task", "p2po", "--recipe", "robust", "--symmetry", "so2", "--clone_iters", 0, "--log_std", 1],
+    "ppo plain": ["--task", "pnp", "--num_demos", "0", "--lambda_bc", "0"],
 }
+DDPG = ["so2", "canonical", "plain", "p2po"]
+# Short episodes that grasp or collide: a world in which the arm starts close to the cube.
+NEAR = """
+import kinova_env, math
+def draw(self, options, draw=kinova_env.KinovaEnv._draw):
+    posture, goal, cube = draw(self, options)
+    if self.stage != "train" or cube is None:
+        return posture, goal, cube
+    cube = (math.pi / 4 + 0.085, 0.52, 0.42) if self.row.cube == "object" else (math.pi / 4, 0.57, 0.42)
+    return posture, (-math.pi / 2, 0.5, 0.4), cube
+kinova_env.KinovaEnv._draw = draw
+"""
 EPISODES = "episode,env_steps,return,length,success,collision"
 PROGRESS = ("epoch,env_steps,demo_env_steps,seconds,EpRet,EpLen,Success,L_O,L_BC,L_C,L_A,mask_fraction,Q_mean,Q_max,"
             "pretanh_own,pretanh_demo,bc_relative_error,eval_success,eval_return")  # fmt: skip
@@ -144,7 +165,10 @@ def server(tmp_path_factory):
 
 
 def argv_of(folder, *flags):
-    return ["ddpg_demoease.py", *TINY, *flags, "--data_dir", folder.parent, "--name", folder.name]
+    """The command line of a tiny run; PPO's where the flags are those of an agent of its own."""
+    ppo = any(list(flags[: len(own)]) == own for agent, own in AGENTS.items() if agent.startswith("ppo"))
+    script = ["ppo_demoease.py", *TINY_PPO] if ppo else ["ddpg_demoease.py", *TINY]
+    return [*script, *flags, "--data_dir", folder.parent, "--name", folder.name]
 
 
 @pytest.fixture(scope="session")
@@ -155,7 +179,7 @@ def unbroken(server, tmp_path_factory):
     def folder_of(agent):
         if agent not in folders:
             folder = tmp_path_factory.mktemp("unbroken") / "run"
-            process = server.run(*argv_of(folder, *AGENTS[agent]))
+            process = server.run(*argv_of(folder, *AGENTS[agent]), first=NEAR)
             assert process.code == 0 and process.err == "", process.err
             folders[agent] = folder
         return folders[agent]
@@ -203,7 +227,7 @@ def stop(server, folder, flags, steps, number, delay=0.0):
         shutil.rmtree(before, ignore_errors=True)
         if folder.exists():
             shutil.copytree(folder, before)
-        process = server.start(*argv_of(folder, *flags, "--resume"), first=SLOWLY)
+        process = server.start(*argv_of(folder, *flags, "--resume"), first=SLOWLY + NEAR)
         while process.poll() is None and steps_done(folder) < steps:
             time.sleep(0.002)
         time.sleep(delay)
@@ -221,16 +245,26 @@ def stop(server, folder, flags, steps, number, delay=0.0):
 # ---- killed, interrupted, resumed ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("agent", ["so2", "p2po", "ppo paper", "ppo robust"])
 def test_a_run_killed_at_five_moments_and_resumed_equals_one_never_killed(server, unbroken, tmp_path, agent):
     folder, draw = tmp_path / "run", random.Random(agent)
     for part in range(5):
         moment = (part + draw.random()) / 5 * 0.85 * STEPS
         killed = stop(server, folder, AGENTS[agent], moment, signal.SIGKILL, delay=draw.uniform(0, 0.08))
         assert killed.code == -signal.SIGKILL
-    last = server.run(*argv_of(folder, *AGENTS[agent], "--resume"))
+    last = server.run(*argv_of(folder, *AGENTS[agent], "--resume"), first=NEAR)
     assert last.code == 0 and last.err == ""
     assert curves(folder) == curves(unbroken(agent))
+
+
+@pytest.mark.parametrize("agent", ["p2po", "ppo so2"])
+def test_those_runs_have_collisions_with_the_cube_in_their_episodes(unbroken, agent):
+    assert "cube" in {row["collision"] for row in rows_of(unbroken(agent) / "episodes.csv")}
+
+
+@pytest.mark.parametrize("agent", ["ppo paper", "ppo robust"])
+def test_those_runs_have_grasps_in_their_episodes(unbroken, agent):
+    assert max(float(row["return"]) for row in rows_of(unbroken(agent) / "episodes.csv")) > 1
 
 
 KILL_AT_RENAME = """
@@ -384,8 +418,10 @@ def test_a_run_folder_holds_the_files_of_the_design_and_no_others(unbroken, agen
     for name in ("checkpoint.pt", "policy.pt"):
         assert isinstance(torch.load(folder / name, weights_only=True), dict)
     policy = torch.load(folder / "policy.pt", weights_only=True)
-    symmetry = {"so2": "so2", "canonical": "canonical", "plain": "gas"}[agent]
-    assert policy["task"] == "p2p" and policy["sizes"] == [22, 16, 16, 4] and policy["symmetry"] == symmetry
+    config = json.loads((folder / "config.json").read_text())
+    width = 22 if config["task"] == "p2p" else 25
+    assert policy["task"] == config["task"] and policy["symmetry"] == config["symmetry"]
+    assert policy["sizes"] == [width, 16, 16, 4] and policy["output"] == ("tanh" if agent in DDPG else "linear")
     assert not {"name", "time", "seed"} & set(policy)
 
 
@@ -395,21 +431,24 @@ def test_the_curves_of_a_run_fit_together(unbroken, agent):
     episodes, progress = rows_of(folder / "episodes.csv"), rows_of(folder / "progress.csv")
     assert [int(row["episode"]) for row in episodes] == list(range(1, len(episodes) + 1)) and len(episodes) >= 8
     assert np.cumsum([int(row["length"]) for row in episodes]).tolist() == [int(row["env_steps"]) for row in episodes]
-    assert any(int(row["env_steps"]) % EPOCH and int(row["length"]) == 28 for row in episodes)  # over epoch ends
+    crossing = [row for row in episodes if (int(row["env_steps"]) - 1) // EPOCH >
+                (int(row["env_steps"]) - int(row["length"])) // EPOCH]  # fmt: skip
+    assert crossing  # episodes go on over the ends of epochs
     assert {row["success"] for row in episodes} <= {"0", "1"}
-    assert {row["collision"] for row in episodes} <= {"", "self"}
+    assert {row["collision"] for row in episodes} <= {"", "self", "cube"}
     assert [(row["epoch"], row["env_steps"]) for row in progress] == [(f"{n}", f"{EPOCH * n}") for n in range(1, 7)]
     seconds = [float(row["seconds"]) for row in progress]
     assert seconds == sorted(seconds) and seconds[0] > 0
     own = {"L_O", "L_C", "L_A", "Q_mean", "Q_max", "pretanh_own"}
     of_demos = {"L_BC", "mask_fraction", "pretanh_demo", "bc_relative_error"}
-    measured = own | (of_demos if agent != "plain" else set())
+    plain = agent.endswith("plain")
+    measured = own | (of_demos if not plain else set())
     for row in progress:
         filled = {column for column, value in row.items() if value != ""}
         assert all(np.isfinite(float(row[column])) for column in filled)
-        assert filled & (own | of_demos) == (measured if int(row["env_steps"]) >= 70 else set())
+        assert filled & (own | of_demos) == (measured if int(row["env_steps"]) >= 70 or agent not in DDPG else set())
         assert not filled & {"eval_success", "eval_return"}
-    assert {float(row["demo_env_steps"]) > 0 for row in progress} == {agent != "plain"}
+    assert {float(row["demo_env_steps"]) > 0 for row in progress} == {not plain}
 
 
 def test_config_holds_every_flag_the_command_and_the_versions(unbroken):
@@ -426,16 +465,18 @@ def test_config_holds_every_flag_the_command_and_the_versions(unbroken):
 
 @pytest.mark.parametrize("recipe", ["paper", "robust"])
 @pytest.mark.parametrize("task", ["p2p", "p2po", "pnp"])
-def test_every_task_trains_with_every_recipe_and_its_agent_can_be_tested(server, tmp_path, task, recipe):
-    argv = f"""ddpg_demoease.py --task {task} --recipe {recipe} --hidden_sizes 16 16 --epochs 2 --steps_per_epoch 30
-               --max_ep_len 25 --num_demos 1 --start_steps 20 --update_after 30 --update_every 15 --eval_every 2
-               --eval_trials 1 --data_dir {tmp_path}""".split()
+@pytest.mark.parametrize("algo", ["ddpg", "ppo"])
+def test_every_task_trains_with_every_recipe_and_its_agent_can_be_tested(server, tmp_path, algo, task, recipe):
+    argv = f"""{algo}_demoease.py --task {task} --recipe {recipe} --hidden_sizes 16 16 --epochs 2 --steps_per_epoch 200
+               --max_ep_len 25 --num_demos 1 --eval_every 2 --eval_trials 1 --data_dir {tmp_path}""".split()
+    argv += dict(ddpg="--start_steps 20 --update_after 30 --update_every 50", ppo="--train_iters 2")[algo].split()
+    argv += ["--clone_iters", "5"] if (algo, recipe) == ("ppo", "robust") else []
     done = server.run(*argv)
     assert done.code == 0, done.err
     assert done.out.count("\n") >= 4 and "mask_fraction" in done.out  # not quiet: a table, one line an epoch
     (folder,) = tmp_path.iterdir()
     number, lam = {"p2p": (1, "1.8"), "p2po": (1, "2"), "pnp": (1, "15")}[task]
-    assert folder.name.startswith(f"{task}-ddpg-{recipe}-N{number}-lambda{lam}-") and folder.name.endswith("seed0")
+    assert folder.name.startswith(f"{task}-{algo}-{recipe}-N{number}-lambda{lam}-") and folder.name.endswith("seed0")
     rows = rows_of(folder / "progress.csv")
     assert [row["eval_success"] == "" for row in rows] == [True, False] and rows[1]["eval_return"] != ""
     assert rows[0]["L_C"] != "" and rows[0]["L_BC"] != ""
@@ -525,5 +566,6 @@ def test_a_bad_command_line_is_exit_code_2_and_one_line_and_leaves_nothing_behin
 
 
 def test_the_help_names_every_flag(server):
-    process = server.run("ddpg_demoease.py", "--help")
-    assert process.code == 0 and all(f"--{field.name}" in process.out for field in fields(ddpg.Flags))
+    for script in (ddpg, ppo):
+        process = server.run(Path(script.__file__).name, "--help")
+        assert process.code == 0 and all(f"--{field.name}" in process.out for field in fields(script.Flags))
