@@ -8,8 +8,8 @@
 
 Two recipes. `paper` is the algorithm as printed. `robust` adds six parts, each a flag of its own: LayerNorm in the
 critic, Bellman targets clipped to possible returns, faster target networks, L_O divided by |mean Q|, learning rates
-that fall to 0, and a symmetry for the networks; its demonstrations come from the faster PID gains. README.md has every
-measured figure, with the minutes it took, and the list of differences from the paper.
+that fall to 0 in the second half, and a symmetry for the networks; its demonstrations come from the faster PID gains.
+README.md has every measured figure, with the minutes it took, and the list of differences from the paper.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
 
@@ -75,7 +75,7 @@ class Flags:
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
-    lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the run")
+    lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -319,7 +319,7 @@ class Learner:
         n = f.update_every
         if f.lr_decay:
             for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-                group["lr"] = lr * left
+                group["lr"] = lr * min(1.0, 2 * left)
         rows, rows_demo = B_o.sample(f.batch_size, n), B_d.sample(f.demo_batch_size, n) if B_d else None
         if f.symmetry == "so2":  # each transition turned by an angle of its own
             rows = turn(rows, self.widths)

@@ -209,12 +209,12 @@ def test_a_saved_learner_goes_on_bit_for_bit():
     assert torch.equal(learner.net.flat, other.net.flat) and torch.equal(learner.target.flat, other.target.flat)
 
 
-@pytest.mark.parametrize("decay, factor", [(True, 0.25), (False, 1.0)])
-def test_lr_decay_scales_both_learning_rates_by_the_fraction_of_the_run_still_to_come(decay, factor):
+@pytest.mark.parametrize("decay, left, factor", [(True, 0.25, 0.5), (True, 0.75, 1.0), (True, 0, 0), (False, 0.25, 1)])
+def test_lr_decay_lets_both_learning_rates_fall_to_0_over_the_second_half_of_the_run(decay, left, factor):
     flags = complete(hidden_sizes=(8,), pi_lr=2e-3, q_lr=5e-3, lr_decay=decay, update_every=2, symmetry="none")
     learner, buffer = ddpg.Learner(flags, 22), ddpg.ReplayBuffer(22, 10)
     buffer.load({"rows": batch_of(10, 22, torch.Generator().manual_seed(0))[0], "next": 0})
-    learner.block(buffer, buffer, left=0.25)
+    learner.block(buffer, buffer, left=left)
     assert [group["lr"] for group in learner.optimizer.param_groups] == [2e-3 * factor, 5e-3 * factor]
 
 
