@@ -127,12 +127,13 @@ def postures(position, pitch=None):
 
 def grasp_postures(cube):
     """Joint angles (M, 4) that grasp a P&P cube at `cube` (3,), with the smallest |pitch| <= EPSILON_Q; M may be 0."""
-    steps = np.radians(np.arange(0, math.degrees(EPSILON_Q) - 0.5, 0.5))
-    for pitch in steps:  # horizontal first
-        found = postures(cube, [pitch, -pitch])
-        if len(found):
-            return found
-    return np.empty((0, 4))
+    found = postures(cube, [0.0, -0.0])  # horizontal first
+    if len(found):
+        return found
+    steps = np.radians(np.arange(0.5, math.degrees(EPSILON_Q) - 0.5, 0.5))
+    found = postures(cube, np.concatenate([steps, -steps]))
+    pitch = np.abs(wrap(math.pi / 2 - (found[:, 1] - found[:, 2] - found[:, 3])))
+    return found[pitch < pitch.min(initial=math.inf) + 1e-6]
 
 
 def start_posture(theta, rho, z):
