@@ -127,7 +127,7 @@ def postures(position, pitch=None):
 
 def grasp_postures(cube):
     """Joint angles (M, 4) that grasp a P&P cube at `cube` (3,), with the smallest |pitch| <= EPSILON_Q; M may be 0."""
-    found = postures(cube, [0.0, -0.0])  # horizontal first
+    found = postures(cube, 0.0)  # horizontal first
     if len(found):
         return found
     steps = np.radians(np.arange(0.5, math.degrees(EPSILON_Q) - 0.5, 0.5))

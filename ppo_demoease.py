@@ -132,7 +132,7 @@ def complete(flags):
     flags = fill_in(flags)
     flags.hidden_sizes = tuple(flags.hidden_sizes)
     logx.check_ranges(flags)
-    printed = fill_in(Flags(task=flags.task, recipe=flags.recipe, num_demos=flags.num_demos))
+    printed = fill_in(Flags(task=flags.task, recipe=flags.recipe, num_demos=flags.num_demos, quick=flags.quick))
     changed = {k: v for k, v in asdict(flags).items() if k not in NOT_A_VARIANT and v != getattr(printed, k)}
     variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
     if len(variant) > 80:
@@ -277,7 +277,7 @@ class Learner:
         self.net = ActorCritic(obs_dim, flags.hidden_sizes, flags.log_std, flags.device)
         self.optimizer = self.make_optimizer(flags.pi_lr, flags.vf_lr)
         self.actor = self.net if flags.device == "cpu" else deepcopy(self.net).cpu()  # what acts
-        self.return_range = (-4.0, TASKS[flags.task].return_max) if flags.clip_value else (None, None)
+        self.return_range = (-4.0, TASKS[flags.task].return_max)
 
     def make_optimizer(self, pi_lr, vf_lr):
         actor = [*self.net.mu_net.parameters(), self.net.log_std]
