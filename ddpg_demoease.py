@@ -590,7 +590,7 @@ def train(flags, variant=""):
     return run.folder
 
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is what Slurm sends before the time is up
 TABLE_COLUMNS = ("epoch", "env_steps", "EpRet", "Success", "EpLen", "L_BC", "mask_fraction", "Q_mean", "Q_max",
                  "pretanh_own", "bc_relative_error", "eval_success")  # fmt: skip
 TABLE = "{:>5} {:>9} {:>7} {:>7} {:>6} {:>9} {:>13} {:>7} {:>6} {:>11} {:>17} {:>12}"

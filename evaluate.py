@@ -27,7 +27,7 @@ from tqdm import tqdm
 import gas
 import logx
 import pid_demo
-from kinova_env import OBSERVATION, TASKS
+from kinova_env import OBSERVATION, TASKS, grasped
 
 COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm"]
 COLUMNS += ["goal_theta", "goal_rho", "goal_z"]
@@ -37,14 +37,16 @@ FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the 
 class Policy:
     """A deterministic policy as stored in `policy.pt`: callable, obs (n,) float32 -> action (4,) float32.
 
-    stored: {"task", "symmetry", "sizes": [n, ..., 4], "output": "tanh" | "linear", "weights": {name: tensor}}.
+    stored: {"task", "symmetry", "sizes": [n, ..., 4], "output": "tanh" | "linear", "weights": {name: tensor}}, and
+    perhaps "grasp_input": True where the network has one input more, 1 while the cube is grasped.
     """
 
     def __init__(self, stored):
         self.task = stored["task"]
         self.canonical = stored["symmetry"] == "canonical"
         sizes = stored["sizes"]
-        if (sizes[0], sizes[-1]) != (sum(width for _, width, _ in OBSERVATION[self.task]), 4):
+        self.grasp_input = bool(stored.get("grasp_input"))
+        if (sizes[0] - self.grasp_input, sizes[-1]) != (sum(width for _, width, _ in OBSERVATION[self.task]), 4):
             raise ValueError(f"sizes {sizes} do not fit task {self.task}")
         layers = []
         with torch.device("meta"):  # draws no random numbers: a policy may be made in the middle of a run
@@ -56,6 +58,8 @@ class Policy:
 
     def __call__(self, obs):
         s = gas.canonical(obs) if self.canonical else obs
+        if self.grasp_input:
+            s = np.concatenate((s, np.float32(grasped(s))[..., None]), axis=-1)
         with torch.inference_mode():
             return np.clip(self.net(torch.from_numpy(s)).numpy(), -1, 1)
 
@@ -122,7 +126,7 @@ def _trials(job):
 def run_trials(task, source, trials=500, jobs=1, quiet=False):
     """Test trials 0 ... trials-1. source: a run folder (Path) or PID gains. Returns the rows of evaluation.csv."""
     chunks = [(task, source, list(range(i, min(i + 10, trials)))) for i in range(0, trials, 10)]
-    bar = dict(total=len(chunks), desc="trials / 10", disable=quiet, leave=False)
+    bar = dict(total=len(chunks), desc="trials / 10", disable=quiet or None, leave=False)
     if jobs == 1:
         parts = list(tqdm(map(_trials, chunks), **bar))
     else:

@@ -136,6 +136,12 @@ def grasp_postures(cube):
     return found[pitch < pitch.min(initial=math.inf) + 1e-6]
 
 
+def grasped(obs):
+    """Whether the cube is in the gripper, P_o = P_e, in P&P observations (..., 25), numpy or torch. Returns (...)."""
+    P_g, e, P_o = obs[..., 16:19], obs[..., 19:22], obs[..., 22:25]
+    return ((P_o - P_g + e) ** 2).sum(-1) < 1e-6  # 1 mm
+
+
 def start_posture(theta, rho, z):
     """Joint angles (4,) of a start pose: TCP at cylinder coordinates (rad, m, m), tool horizontal and radially outward.
 

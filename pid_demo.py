@@ -23,7 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
-from kinova_env import OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
+from kinova_env import EPSILON, OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
 
 CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it (at most) on P&P
 RETRACT = 0.35  # m, radius to which it draws back before it rises beside a cube on P2P-O
@@ -64,7 +64,8 @@ class PID:
         return [goal]
 
     def _approach(self):
-        """Postures that grasp on the cube's horizontal axis, as far before the cube as the TCP is beside that axis.
+        """Postures that grasp on the cube's horizontal axis, as far before its point EPSILON behind the cube as the TCP
+        is beside the axis: aiming past the cube, the arm does not slow down where the grasp comes within reach.
 
         A function of the state, not of what was reached before: a clone of the demonstrations can follow it.
         """
@@ -72,7 +73,7 @@ class PID:
         rho = math.hypot(x, y)
         ahead = x_e * x + y_e * y > 0  # else the arm has yet to turn round
         beside = math.hypot((x_e * y - y_e * x) / rho, z_e - z) if ahead else math.inf
-        for back in np.linspace(min(self.clearance, beside, 0.9 * rho), 0, 6):  # out of reach: less far back
+        for back in np.linspace(min(self.clearance, beside - EPSILON, 0.9 * rho), 0, 6):  # out of reach: less far back
             found = grasp_postures(((1 - back / rho) * x, (1 - back / rho) * y, z))
             if len(found):
                 return found

@@ -33,7 +33,7 @@ import evaluate
 import gas
 import logx
 import pid_demo
-from kinova_env import TASKS
+from kinova_env import TASKS, grasped
 from logx import flag
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
@@ -84,6 +84,8 @@ class Flags:
     after_kl: str | None = flag(None, "what goes on for the rest of an epoch once D_KL has reached target_kl: "
                                 "none, critic: L_C, all: L_BC and L_C", ("none", "critic", "all"))  # fmt: skip
     normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d")
+    grasp_input: bool | None = flag(None, "the networks are told, as one more input, whether the cube is grasped "
+                                    "(P_o = P_e); pnp only")  # fmt: skip
     clip_value: bool | None = flag(None, "clip V to the range of possible returns")
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
@@ -106,10 +108,10 @@ BY_TASK = {  # tab:reward, tab:reward2
 BY_RECIPE = {
     "paper": dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, log_std=-0.5, pi_lr=3e-4,
                   demo_noise=0.0, demos_in_B_o=True, clone_iters=0, mask="reward", after_kl="none",
-                  normalize_obs=False, clip_value=False),
+                  normalize_obs=False, grasp_input=False, clip_value=False),
     "robust": dict(symmetry="canonical", gains="fast", train_iters=80, demo_batch_size=256, log_std=-2.0, pi_lr=3e-6,
                    demo_noise=0.2, demos_in_B_o=False, clone_iters=4000, mask="none", after_kl="critic",
-                   normalize_obs=True, clip_value=True),
+                   normalize_obs=True, grasp_input=True, clip_value=True),
 }  # fmt: skip
 QUICK = dict(recipe="robust", epochs=5)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
@@ -121,7 +123,7 @@ def fill_in(flags):
     """The flags with what the task and the recipe decide in place of None."""
     recipe = flags.recipe or ("robust" if flags.quick else "paper")
     defaults = {"epochs": 50} | BY_TASK[flags.task] | BY_RECIPE[recipe] | (QUICK if flags.quick else {})
-    defaults["recipe"] = recipe
+    defaults |= {"recipe": recipe, "grasp_input": defaults["grasp_input"] and flags.task == "pnp"}
     N = defaults["num_demos"] if flags.num_demos is None else flags.num_demos
     defaults["demos_per_epoch"] = max(1, N if recipe == "robust" else -(-N // 5))
     return replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
@@ -140,6 +142,8 @@ def complete(flags):
     if flags.name is None:
         flags.name = f"{flags.task}-ppo-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
         flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
+    if flags.grasp_input and flags.task != "pnp":
+        logx.fail(f"--grasp_input: on --task pnp only, not {flags.task}, which has nothing to grasp")
     if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
         logx.fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
     if flags.device == "cuda" and not torch.cuda.is_available():
@@ -209,22 +213,28 @@ def mlp(sizes):
 
 
 class ActorCritic(nn.Module):
-    """pi_omega: s -> N(mu, sigma), sigma the same in every state, and V_nu: s -> R, on (s - s_mean) / s_std."""
+    """pi_omega: s -> N(mu, sigma), sigma the same in every state, and V_nu: s -> R, on (s - s_mean) / s_std, and with
+    grasp_input on 1 where the cube is grasped, else 0."""
 
-    def __init__(self, obs_dim, hidden_sizes, log_std, device):
+    def __init__(self, obs_dim, hidden_sizes, log_std, grasp_input, device):
         super().__init__()
-        self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
-        self.v_net = mlp([obs_dim, *hidden_sizes, 1])
+        self.grasp_input = grasp_input
+        self.mu_net = mlp([obs_dim + grasp_input, *hidden_sizes, 4])
+        self.v_net = mlp([obs_dim + grasp_input, *hidden_sizes, 1])
         self.log_std = nn.Parameter(torch.full((4,), log_std))
         self.register_buffer("s_mean", torch.zeros(obs_dim))
         self.register_buffer("s_std", torch.ones(obs_dim))
         self.to(device)
 
+    def inputs(self, s):
+        x = (s - self.s_mean) / self.s_std
+        return torch.cat((x, grasped(s).unsqueeze(-1).float()), dim=-1) if self.grasp_input else x
+
     def mu(self, s):
-        return self.mu_net((s - self.s_mean) / self.s_std)
+        return self.mu_net(self.inputs(s))
 
     def V(self, s):
-        return self.v_net((s - self.s_mean) / self.s_std).squeeze(-1)
+        return self.v_net(self.inputs(s)).squeeze(-1)
 
     def log_prob(self, mu, a):
         """log pi(a|s), (n,)."""
@@ -274,7 +284,7 @@ class Learner:
 
     def __init__(self, flags, obs_dim):
         self.flags, self.widths = flags, (obs_dim, 4, 1, obs_dim, 1, 1, 1)
-        self.net = ActorCritic(obs_dim, flags.hidden_sizes, flags.log_std, flags.device)
+        self.net = ActorCritic(obs_dim, flags.hidden_sizes, flags.log_std, flags.grasp_input, flags.device)
         self.optimizer = self.make_optimizer(flags.pi_lr, flags.vf_lr)
         self.actor = self.net if flags.device == "cpu" else deepcopy(self.net).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
@@ -407,10 +417,17 @@ class Learner:
         """What policy.pt holds: see evaluate.Policy. The normalisation is folded into the first layer."""
         f, net = self.flags, self.net
         weights = {name: w.detach().cpu().clone() for name, w in net.mu_net.state_dict().items()}
-        weights["0.weight"] /= net.s_std.cpu()
-        weights["0.bias"] -= weights["0.weight"] @ net.s_mean.cpu()
-        sizes = [net.mu_net[0].in_features, *f.hidden_sizes, 4]
-        return {"task": f.task, "symmetry": f.symmetry, "sizes": sizes, "output": "linear", "weights": weights}
+        of_s = weights["0.weight"][:, : self.widths[0]]
+        of_s /= net.s_std.cpu()
+        weights["0.bias"] -= of_s @ net.s_mean.cpu()
+        return {
+            "task": f.task,
+            "symmetry": f.symmetry,
+            "sizes": [net.mu_net[0].in_features, *f.hidden_sizes, 4],
+            "output": "linear",
+            "grasp_input": f.grasp_input,
+            "weights": weights,
+        }
 
 
 # ---- training loop ---------------------------------------------------------------------------------------------------
@@ -614,7 +631,7 @@ def train(flags, variant=""):
     return run.folder
 
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is what Slurm sends before the time is up
 TABLE_COLUMNS = ("epoch", "env_steps", "EpRet", "Success", "EpLen", "L_BC", "mask_fraction", "Q_mean", "Q_max",
                  "sigma", "KL", "learn_O", "bc_relative_error", "eval_success")  # fmt: skip
 TABLE = "{:>5} {:>9} {:>7} {:>7} {:>6} {:>9} {:>13} {:>7} {:>6} {:>6} {:>8} {:>7} {:>17} {:>12}"

@@ -6,6 +6,7 @@ import math
 import signal
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -128,6 +129,27 @@ def test_advantages_have_mean_zero_and_deviation_one_and_equal_ones_are_zero():
     assert ppo.advantages(zero, torch.ones(5), zero, zero, 0.99, 0.97).tolist() == [0] * 5
 
 
+# ---- the input of the networks ---------------------------------------------------------------------------------------
+
+
+def test_grasp_input_is_one_exactly_while_the_environment_says_that_the_cube_is_grasped():
+    env = gymnasium.make("KinovaPnP-v0", stage="demo", disable_env_checker=True)
+    pid, seen = pid_demo.PID(env, "fast"), set()
+    net = ppo.ActorCritic(25, (8,), -0.5, True, "cpu")
+    for seed in range(3):
+        s, info = env.reset(seed=seed)
+        done = False
+        while not done:
+            for view in (s, gas.canonical(s), gas.rotate(s, 1.234)):
+                x = net.inputs(torch.from_numpy(view))
+                assert x.shape == (26,) and x[-1] == info["grasped"]
+            seen.add(info["grasped"])
+            s, _, terminated, truncated, info = env.step(pid.act())
+            done = terminated or truncated
+    assert seen == {True, False}
+    env.close()
+
+
 # ---- the update against the paper ------------------------------------------------------------------------------------
 
 
@@ -158,11 +180,18 @@ class Paper:
         self.omega, self.nu = [*self.mu.parameters(), self.log_std], list(self.v.parameters())
         self.adam_pi, self.adam_v = torch.optim.Adam(self.omega, lr=pi_lr), torch.optim.Adam(self.nu, lr=vf_lr)
 
+    def inputs(self, s):
+        x = [(s - self.mean) / self.std]
+        if self.mu[0].in_features == 26:  # the 26th says whether the cube is where the TCP is
+            P_e = s[:, 16:19] - s[:, 19:22]
+            x.append(torch.tensor([[float(torch.dist(a, b) < 1e-3)] for a, b in zip(P_e, s[:, 22:], strict=True)]))
+        return torch.cat(x, 1)
+
     def pi(self, s):
-        return Normal(self.mu((s - self.mean) / self.std), torch.exp(self.log_std))
+        return Normal(self.mu(self.inputs(s)), torch.exp(self.log_std))
 
     def V(self, s, clip=True):
-        V = self.v((s - self.mean) / self.std)[:, 0]
+        V = self.v(self.inputs(s))[:, 0]
         return torch.clip(V, *self.clip) if clip and self.clip else V
 
     def epoch(self, found, demos, batches, demo_batches):
@@ -270,6 +299,10 @@ def test_an_epoch_is_that_of_a_plain_reimplementation_of_the_paper(task, part, t
     paper = Paper(learner, **mine, **settings)
     found = [*trajectories(["true", "timeout"], obs_dim, 3, own=0), *trajectories(ENDS, obs_dim, 4)]
     demos = trajectories(["true", "true", "timeout", "true", "timeout", "true"], obs_dim, 7, own=0)
+    for x in found + demos:
+        if task == "pnp":  # in half of the states the cube is grasped
+            for s in (x.s, x.s2):
+                s[::2, 22:] = s[::2, 16:19] - s[::2, 19:22]
     R_demo = [R for x in demos for R in sums(x, torch.zeros(len(x.r)), 0.0, 0.9, 1)[0]]
     B_o, B_d = buffer_of(found), buffer_of(demos)
     counts = []
@@ -444,7 +477,7 @@ def test_clip_value_holds_values_between_minus_four_and_the_largest_return(task,
 def two_policies():
     """(ActorCritic with unlike sigmas, the means and log sigma of an older policy)."""
     torch.manual_seed(0)
-    net = ppo.ActorCritic(22, (8,), -0.5, "cpu")
+    net = ppo.ActorCritic(22, (8,), -0.5, False, "cpu")
     with torch.no_grad():
         net.log_std.copy_(torch.tensor([-2.0, -0.5, 0.3, 0.0]))
     return net, torch.randn(7, 4), torch.tensor([-1.5, -0.7, 0.3, 0.4])
@@ -468,7 +501,7 @@ def test_kl_is_from_the_policy_that_acted_to_the_present_one():
 
 
 def test_networks_are_two_relu_stacks_with_a_sigma_that_no_state_changes():
-    net = ppo.ActorCritic(22, (8, 12), -0.5, "cpu")
+    net = ppo.ActorCritic(22, (8, 12), -0.5, False, "cpu")
     for part, n_out in ((net.mu_net, 4), (net.v_net, 1)):
         assert [type(layer).__name__ for layer in part] == 2 * ["Linear", "ReLU"] + ["Linear"]
         assert [p.shape[0] for p in part.parameters()] == [8, 8, 12, 12, n_out, n_out]
@@ -502,13 +535,17 @@ def test_normalisation_is_by_mean_and_deviation_of_the_demonstrated_states_or_a_
         assert torch.equal(learner.net.V(s), learner.net.v_net(seen)[:, 0])
 
 
-@pytest.mark.parametrize("symmetry", ["none", "canonical"])
-def test_the_saved_policy_is_the_one_that_acts_with_its_normalisation_folded_in(symmetry):
-    s = states(200, 22)
+@pytest.mark.parametrize("task, symmetry", [("p2p", "none"), ("p2p", "canonical"), ("pnp", "canonical")])
+def test_the_saved_policy_is_the_one_that_acts_with_its_normalisation_folded_in(task, symmetry):
+    obs_dim = {"p2p": 22, "pnp": 25}[task]
+    s = states(200, obs_dim)
+    if task == "pnp":  # in half of the states the cube is grasped
+        s[::2, 22:] = s[::2, 16:19] - s[::2, 19:22]
     view = gas.canonical(s) if symmetry == "canonical" else s
-    learner, B_o = a_learner(symmetry=symmetry, log_std=-2.0)
-    B_d = ppo.TrajectoryBuffer(22, 200)
-    B_d.store_rows(torch.cat((view, torch.zeros(200, 30)), 1))
+    learner = ppo.Learner(complete(task=task, recipe="robust", symmetry=symmetry, **SETTINGS), obs_dim)
+    assert learner.net.grasp_input == (task == "pnp")
+    B_o, B_d = buffer_of(trajectories(ENDS, obs_dim, 4)), ppo.TrajectoryBuffer(obs_dim, 200)
+    B_d.store_rows(torch.cat((view, torch.zeros(200, obs_dim + 8)), 1))
     learner.normalize(B_d)
     learner.epoch(B_o, None, torch.zeros(0))
     file = io.BytesIO()
@@ -641,7 +678,7 @@ ALL_TASKS = dict(epochs=50, steps_per_epoch=4000, batch_size=800, gamma=0.99, la
 RECIPES = {
     "paper": dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, log_std=-0.5, demo_noise=0,
                   pi_lr=3e-4, demos_in_B_o=True, clone_iters=0, mask="reward", after_kl="none", normalize_obs=False,
-                  clip_value=False),
+                  grasp_input=False, clip_value=False),
     "robust": dict(symmetry="canonical", gains="fast", train_iters=80, demo_batch_size=256, log_std=-2, demo_noise=0.2,
                    demos_in_B_o=False, clone_iters=4000, mask="none", after_kl="critic", normalize_obs=True,
                    clip_value=True, pi_lr=3e-6),
@@ -655,7 +692,7 @@ def test_defaults_are_those_of_the_papers_table_and_the_recipe(task, recipe):
     flags = vars(complete(task=task, recipe=recipe))
     expected = DEFAULTS[task] | ALL_TASKS | RECIPES[recipe or "paper"] | {"recipe": recipe or "paper"}
     per_epoch = {"p2p": 20, "p2po": 50, "pnp": 80} if recipe != "robust" else {"p2p": 100, "p2po": 250, "pnp": 400}
-    expected["demos_per_epoch"] = per_epoch[task]
+    expected |= {"demos_per_epoch": per_epoch[task], "grasp_input": recipe == "robust" and task == "pnp"}
     assert {name: flags[name] for name in expected} == expected
     assert {name for name, value in flags.items() if value is None} == NO_DEFAULT
 
@@ -705,7 +742,7 @@ CHANGES = dict(gamma=0.9, gains="fast", hidden_sizes=(8, 8), demos="some/where/d
                steps_per_epoch=300, batch_size=10, demo_batch_size=10, lam=0.5, clip_ratio=0.1, target_kl=1.0,
                pi_lr=1e-4, vf_lr=1e-4, log_std=-1.0, train_iters=3, demos_per_epoch=7, demo_noise=0.1,
                demos_in_B_o=False, clone_iters=3, mask="none", after_kl="all", normalize_obs=True,
-               clip_value=True)  # fmt: skip
+               grasp_input=True, clip_value=True)  # fmt: skip
 
 
 def test_the_default_names_of_runs_that_differ_in_any_setting_differ_and_can_be_folders(tmp_path):
