@@ -9,6 +9,7 @@ are cut back to the checkpoint they belong to, so that a killed and resumed run 
 """
 
 import argparse
+import contextlib
 import csv
 import dataclasses
 import fcntl
@@ -85,10 +86,14 @@ def check_ranges(flags):
 def atomic_write(path, write):
     """Calls write(file) on a binary file beside `path`, then puts it in place whole (fsync, rename)."""
     temporary = Path(f"{path}.part")
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
     os.replace(temporary, path)
 
 
@@ -137,6 +142,9 @@ def is_new(folder, resume):
         fail(f"--name {folder.name}: {folder} cannot be read ({error.strerror})")
 
 
+FORMAT = 1  # of a checkpoint: raised where older ones cannot go on
+
+
 class Run:
     """One run folder, held until the process ends; goes on from the checkpoint there, if any. What is wrong with the
     folder, another process that holds it included, exits with 2."""
@@ -174,17 +182,41 @@ class Run:
             else:
                 path.write_text(",".join(columns) + "\n")
             self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
-        if not self.checkpoint or config["epochs"] > json.loads(self.checkpoint["config"])["epochs"]:
-            text = json.dumps(config | {"command": sys.argv, "versions": versions()}, indent=1).encode()
-            atomic_write(self.folder / "config.json", lambda file: file.write(text))
+        with self._whole():
+            self._write_config(config)
         self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
         self._begin = time.monotonic()
         self._board = SummaryWriter(self.folder) if tensorboard else None
+
+    @contextlib.contextmanager
+    def _whole(self):
+        """Around what writes: a full disk ends the run with 2 and one line; what was saved before stays as it is."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:  # torch.save turns the one into the other
+            print(f"{Path(sys.argv[0]).name}: error: --data_dir {self.folder.parent}: cannot write {self.folder} "
+                  f"({one_line(error)}); go on from its last checkpoint with --resume", file=sys.stderr)  # fmt: skip
+            sys.stderr.flush()
+            os._exit(2)  # the curves' files would try to write once more
+
+    def _write_config(self, config):
+        """config.json: the flags, the command and the versions; those of a resume too, where they are others."""
+        path, made_with = self.folder / "config.json", versions()
+        text = config | {"command": sys.argv, "versions": made_with}
+        if self.checkpoint:
+            before = json.loads(path.read_text())
+            text = (text if config["epochs"] > before["epochs"] else before) | {"versions": before["versions"]}
+            resumed = before.get("resumed_with", [])
+            if made_with != [before["versions"], *resumed][-1]:
+                text["resumed_with"] = [*resumed, made_with]
+        atomic_write(path, lambda file: file.write(json.dumps(text, indent=1).encode()))
 
     def _same_run(self, config):
         """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
         free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
                 "eval_trials", "device"}  # fmt: skip
+        if self.checkpoint.get("format", 1) != FORMAT:
+            raise ValueError(f"{self.folder / 'checkpoint.pt'}: of another version of this code; begin a new --name")
         before = json.loads(self.checkpoint["config"])
         for key in sorted(set(config) | set(before)):
             if key not in free and json.dumps(config.get(key)) != json.dumps(before.get(key)):
@@ -200,20 +232,25 @@ class Run:
         """Appends a row (dict by column; None and NaN are left blank) to "episodes" or "progress"."""
         columns = EPISODES if name == "episodes" else PROGRESS
         values = [row.get(column) for column in columns]
-        csv.writer(self._files[name], lineterminator="\n").writerow(
-            ["" if v is None or v != v else f"{v:.9g}" if isinstance(v, float) else v for v in values]
-        )
+        with self._whole():
+            csv.writer(self._files[name], lineterminator="\n").writerow(
+                ["" if v is None or v != v else f"{v:.9g}" if isinstance(v, float) else v for v in values]
+            )
         if self._board and name == "progress":
             for column, v in zip(columns, values, strict=True):
                 if v is not None:
                     self._board.add_scalar(column, v, row["env_steps"])
 
-    def save(self, state, config):
-        """Writes checkpoint.pt: `state` (tensors and plain types), and what a resume needs of the folder itself."""
-        sizes = {}
-        for name, file in self._files.items():
-            file.flush()
-            os.fsync(file.fileno())
-            sizes[name] = os.fstat(file.fileno()).st_size
-        state = state | {"log_bytes": sizes, "seconds": self.seconds(), "config": json.dumps(config)}
-        atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))
+    def save(self, state, config, policy):
+        """Writes checkpoint.pt, `state` (tensors and plain types) and what a resume needs of the folder itself, and
+        policy.pt."""
+        with self._whole():
+            sizes = {}
+            for name, file in self._files.items():
+                file.flush()
+                os.fsync(file.fileno())
+                sizes[name] = os.fstat(file.fileno()).st_size
+            state = state | {"log_bytes": sizes, "seconds": self.seconds(), "config": json.dumps(config)}
+            state["format"] = FORMAT
+            atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))
+            atomic_write(self.folder / "policy.pt", lambda file: torch.save(policy, file))

@@ -544,8 +544,8 @@ def train(flags, variant=""):
                 "loop": json.dumps(loop),
             },
             config,
+            learner.policy(),
         )
-        logx.atomic_write(run.folder / "policy.pt", lambda file: torch.save(learner.policy(), file))
 
     def stop_at_nan(where):
         logx.atomic_write(run.folder / "nan.pt", lambda file: torch.save(learner.state(), file))

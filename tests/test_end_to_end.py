@@ -288,6 +288,78 @@ def test_a_run_killed_just_before_a_file_is_in_place_resumes_alike(server, unbro
     assert last.code == 0 and last.err == "" and curves(folder) == curves(unbroken("plain"))
 
 
+KILL_IN_WRITE = """
+import io, itertools, os, torch
+def save(state, file, real=torch.save, count=itertools.count(1)):
+    whole = io.BytesIO()
+    real(state, whole)
+    if next(count) == {}:
+        file.write(whole.getvalue()[:int({} * len(whole.getvalue()))])
+        file.flush()
+        os.kill(os.getpid(), 9)
+    file.write(whole.getvalue())
+torch.save = save
+"""
+
+
+@pytest.mark.parametrize("agent", ["plain", "ppo plain"])
+def test_a_run_killed_in_the_middle_of_writing_its_files_resumes_alike(server, unbroken, tmp_path, agent):
+    """KILLS=100 in the environment tries more moments than five."""
+    draw, folder = random.Random(agent), tmp_path / "run"
+    for n in range(int(os.environ.get("KILLS", 5))):
+        if n % 5 == 0:
+            shutil.rmtree(folder, ignore_errors=True)
+        first = NEAR + KILL_IN_WRITE.format(draw.randint(1, 3), draw.random())
+        process = server.run(*argv_of(folder, *AGENTS[agent], "--resume"), first=first)
+        assert process.code == -signal.SIGKILL or (n % 5 and process.code == 0)
+        if n % 5 == 4:
+            last = server.run(*argv_of(folder, *AGENTS[agent], "--resume"), first=NEAR)
+            assert last.code == 0 and last.err == ""
+            assert curves(folder) == curves(unbroken(agent))
+
+
+NO_ROOM = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))
+"""
+
+
+def refused_for_want_of_room(process, folder):
+    return (process.code == 2 and process.err.count("\n") == 1 and "--data_dir" in process.err
+            and str(folder) in process.err and not list(folder.glob("*.part")))  # fmt: skip
+
+
+@pytest.mark.parametrize("bytes", [1500, 4000, 40_000])
+def test_a_run_that_may_not_write_more_says_so_and_goes_on_later_from_its_last_checkpoint(
+    server, unbroken, tmp_path, bytes
+):
+    folder, agent = tmp_path / "run", AGENTS["plain"]
+    cut = server.run(*argv_of(folder, *agent), first=NO_ROOM.format(bytes))
+    assert refused_for_want_of_room(cut, folder)
+    assert server.run(*argv_of(folder, *agent, "--resume")).code == 0
+    assert curves(folder) == curves(unbroken("plain"))
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("size", ["12k", "60k", "100k"])
+def test_a_full_disk_and_a_read_only_one_are_one_line_and_lose_nothing(server, unbroken, tmp_path, size):
+    disk, agent = tmp_path / "disk", AGENTS["plain"]
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", disk], check=True)
+    try:
+        assert refused_for_want_of_room(server.run(*argv_of(disk / "run", *agent)), disk / "run")
+        before = files(disk / "run")
+        subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+        refused = server.run(*argv_of(disk / "run", *agent, "--resume"))
+        assert refused.code == 2 and refused.err.count("\n") == 1 and "--data_dir" in refused.err
+        assert files(disk / "run") == before
+        subprocess.run(["mount", "-o", "remount,rw,size=100m", disk], check=True)
+        assert server.run(*argv_of(disk / "run", *agent, "--resume")).code == 0
+        assert curves(disk / "run") == curves(unbroken("plain"))
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
 def test_an_interrupted_run_says_so_with_130_and_resumes_alike(server, unbroken, tmp_path):
     folder, agent = tmp_path / "run", "so2"
     process = stop(server, folder, AGENTS[agent], 90, signal.SIGINT, delay=0.02)

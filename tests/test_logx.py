@@ -8,6 +8,7 @@ import pickle
 import random
 import re
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -310,7 +311,7 @@ def test_a_resume_cuts_both_curves_back_to_the_checkpoint_and_goes_on_from_there
     for n in (1, 2):
         run.write("episodes", {"episode": n})
     run.write("progress", {"epoch": 1})
-    run.save({"tensor": torch.arange(3)}, CONFIG)
+    run.save({"tensor": torch.arange(3)}, CONFIG, {})
     run.write("episodes", {"episode": 3})
     run.write("progress", {"epoch": 2})
     close(run)
@@ -330,7 +331,7 @@ def test_a_run_is_new_until_it_has_a_checkpoint(tmp_path):
     assert logx.is_new(tmp_path / "a", False) and logx.is_new(tmp_path / "a", True)
     run = begin(tmp_path / "a", CONFIG)
     assert logx.is_new(tmp_path / "a", True)
-    run.save({}, CONFIG)
+    run.save({}, CONFIG, {})
     assert not logx.is_new(tmp_path / "a", True)
 
 
@@ -347,7 +348,7 @@ def test_the_seconds_of_a_resumed_run_include_the_earlier_parts(tmp_path, monkey
     monkeypatch.setattr(logx.time, "monotonic", lambda: now[0])
     run = begin(tmp_path / "a", CONFIG)
     now[0] += 7
-    run.save({}, CONFIG)
+    run.save({}, CONFIG, {})
     now[0] += 1000  # not the run's
     close(run)
     again = begin(tmp_path / "a", CONFIG, resume=True)
@@ -378,7 +379,7 @@ def test_a_run_that_is_held_is_refused_until_it_is_let_go(tmp_path, capsys):
 def test_a_checkpoint_goes_on_only_with_the_flags_it_was_made_with(tmp_path, capsys, key, value):
     run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
-    run.save({}, CONFIG)
+    run.save({}, CONFIG, {})
     run.write("episodes", {"episode": 2})
     close(run)
     before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
@@ -389,7 +390,7 @@ def test_a_checkpoint_goes_on_only_with_the_flags_it_was_made_with(tmp_path, cap
 
 def test_how_long_how_loud_and_where_may_change_on_a_resume(tmp_path):
     run = begin(tmp_path / "a", CONFIG)
-    run.save({}, CONFIG)
+    run.save({}, CONFIG, {})
     close(run)
     changed = CONFIG | dict(epochs=9, name="b", quiet=True, data_dir="x", resume=True, checkpoint_every=2)
     again = begin(tmp_path / "a", changed, resume=True)
@@ -399,7 +400,7 @@ def test_how_long_how_loud_and_where_may_change_on_a_resume(tmp_path):
 def test_a_broken_checkpoint_is_named_and_the_curves_are_left_alone(tmp_path, capsys):
     run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
-    run.save({"t": torch.zeros(100)}, CONFIG)
+    run.save({"t": torch.zeros(100)}, CONFIG, {})
     close(run)
     path = tmp_path / "a" / "checkpoint.pt"
     path.write_bytes(path.read_bytes()[:-50])
@@ -411,7 +412,7 @@ def test_a_broken_checkpoint_is_named_and_the_curves_are_left_alone(tmp_path, ca
 def test_a_curve_shorter_than_its_checkpoint_is_refused_by_name(tmp_path, capsys, shorten):
     run = begin(tmp_path / "a", CONFIG)
     run.write("episodes", {"episode": 1})
-    run.save({}, CONFIG)
+    run.save({}, CONFIG, {})
     close(run)
     shorten(tmp_path / "a" / "episodes.csv")
     assert "episodes.csv" in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
@@ -429,3 +430,34 @@ def test_tensorboard_that_is_not_installed_is_bad_input_and_leaves_no_folder(tmp
     monkeypatch.setitem(logx.sys.modules, "torch.utils.tensorboard", None)
     assert "--tensorboard" in error_line(capsys, begin, tmp_path / "a", CONFIG, tensorboard=True)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_resume_with_other_versions_is_on_record_and_the_first_ones_stay(tmp_path, monkeypatch):
+    def record(commit, **changes):
+        monkeypatch.setattr(logx, "versions", lambda: {"git_commit": commit})
+        logx.Run(tmp_path / "run", CONFIG | changes).save({}, CONFIG | changes, {})
+        return json.loads((tmp_path / "run" / "config.json").read_text())
+
+    assert record("one")["versions"] == {"git_commit": "one"}
+    assert "resumed_with" not in record("one")
+    assert record("two")["resumed_with"] == [{"git_commit": "two"}]
+    assert record("two")["resumed_with"] == [{"git_commit": "two"}]
+    longer = record("one", epochs=CONFIG["epochs"] + 1)
+    assert longer["epochs"] == CONFIG["epochs"] + 1 and longer["versions"] == {"git_commit": "one"}
+    assert longer["resumed_with"] == [{"git_commit": "two"}, {"git_commit": "one"}]
+
+
+def test_a_checkpoint_of_another_format_is_refused_by_name(tmp_path, capsys, monkeypatch):
+    logx.Run(tmp_path / "run", CONFIG).save({}, CONFIG, {})
+    monkeypatch.setattr(logx, "FORMAT", logx.FORMAT + 1)
+    with pytest.raises(SystemExit) as stopped:
+        logx.Run(tmp_path / "run", CONFIG)
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert "checkpoint.pt" in error and "another version" in error and error.count("\n") == 1
+
+
+def test_seconds_do_not_follow_a_clock_that_jumps_back(tmp_path, monkeypatch):
+    run = logx.Run(tmp_path / "run", CONFIG)
+    monkeypatch.setattr(time, "time", lambda: -1e9)
+    assert 0 <= run.seconds() < 100

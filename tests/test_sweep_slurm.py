@@ -10,7 +10,7 @@ from test_sweep import LONG, TINY, curves, run, runs_of, unbroken, wait_for  # n
 
 import sweep
 
-pytestmark = pytest.mark.slurm
+pytestmark = pytest.mark.root
 CONF = """
 ClusterName=one
 SlurmctldHost=localhost
