@@ -602,11 +602,11 @@ def main():
     flags, variant = complete(logx.parse_flags(Flags, __doc__))
     folder = train(flags, variant)
     if flags.quick:
-        results = {str(folder): evaluate.run_trials(flags.task, folder, 100, quiet=flags.quiet)}
-        evaluate.write_csv(folder / "evaluation.csv", results[str(folder)])
-        results[f"PID, {flags.gains} gains"] = evaluate.run_trials(flags.task, flags.gains, 100, quiet=flags.quiet)
-        evaluate.print_table(results)
-        evaluate.show(flags.task, folder, folder / "agent.gif")
+        agents = {str(folder): folder, f"PID, {flags.gains} gains": flags.gains}
+        found = {name: evaluate.run_trials(flags.task, agent, 100, quiet=flags.quiet) for name, agent in agents.items()}
+        evaluate.write(folder, *found[str(folder)])
+        evaluate.print_table({name: rows for name, (rows, _) in found.items()})
+        evaluate.show({str(folder): (flags.task, folder)}, range(6), folder / "agent.gif")
         print(f"wrote {folder / 'agent.gif'}")
 
 

@@ -1,7 +1,8 @@
 """The test study (`Test Study`): trials of a trained run, or of the PID, from the test start pose.
 
     python evaluate.py data/runs/NAME --trials 500 --jobs 2        # prints the table, writes NAME/evaluation.csv
-    python evaluate.py data/runs/NAME --gif agent.gif              # or --watch, in a window
+    python evaluate.py data/runs/NAME --gif agent.gif --show 0 7   # trials 0 and 7; or --watch, in a window
+    python evaluate.py data/runs/NAME --versus data/runs/OTHER     # the paired difference on the same trials
     python evaluate.py --pid --task p2p --gains fast --trials 500
 
 P_scs: successful trials; over the successful ones T_eff: 100 * mean norm(tau_hat) / 2, in percent of the largest
@@ -11,7 +12,9 @@ every agent, and nothing depends on the number of jobs.
 
 import argparse
 import csv
+import importlib.util
 import io
+import json
 import math
 import os
 import sys
@@ -31,6 +34,7 @@ from kinova_env import OBSERVATION, TASKS, grasped
 
 COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm"]
 COLUMNS += ["goal_theta", "goal_rho", "goal_z"]
+PATHS = 20  # trials whose TCP paths are kept
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
 
 
@@ -77,13 +81,15 @@ def load_policy(run_folder):
 
 
 def trial(env, act, i):
-    """Runs test trial i to its end. Returns its row of evaluation.csv (dict) and ||e_t|| in m (length + 1,)."""
+    """Runs test trial i to its end. Returns its row of evaluation.csv (dict), ||e_t|| in m (length + 1,), and the TCP's
+    path in m (length + 1, 3)."""
     s, info = env.reset(seed=FIRST_SEED + i)
-    errors, total, effort, done = [info["distance"]], 0.0, 0.0, False
+    errors, path, total, effort, done = [info["distance"]], [env.unwrapped.tcp], 0.0, 0.0, False
     while not done:
         s, r, terminated, truncated, info = env.step(act(s))
         total, effort = total + r, effort + info["effort"]
         errors.append(info["distance"])
+        path.append(env.unwrapped.tcp)
         done = terminated or truncated
     length = len(errors) - 1
     last = max(1, math.ceil(0.05 * length))
@@ -102,12 +108,12 @@ def trial(env, act, i):
         "goal_rho": math.hypot(x, y),
         "goal_z": z,
     }
-    return row, np.array(errors, dtype=np.float32)
+    return row, np.array(errors, dtype=np.float32), np.array(path, dtype=np.float32)
 
 
-def make_agent(task, source):
+def make_agent(task, source, **render):
     """(test environment, act(obs)) of a run folder, or of the PID where `source` is a name or triple of gains."""
-    env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True)
+    env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True, **render)
     if isinstance(source, Path):
         return env, load_policy(source)
     pid = pid_demo.PID(env, source)
@@ -118,13 +124,19 @@ def _trials(job):
     task, source, numbers = job
     torch.set_num_threads(1)
     env, act = make_agent(task, source)
-    rows = [trial(env, act, i)[0] for i in numbers]
+    done = []
+    for i in numbers:
+        row, errors, path = trial(env, act, i)
+        cube = getattr(env.unwrapped, "cube", (math.nan,) * 3)  # P2P has none
+        done.append((row, errors, (path, env.unwrapped.goal, cube)))
     env.close()
-    return rows
+    return done
 
 
 def run_trials(task, source, trials=500, jobs=1, quiet=False):
-    """Test trials 0 ... trials-1. source: a run folder (Path) or PID gains. Returns the rows of evaluation.csv."""
+    """Test trials 0 ... trials-1. source: a run folder (Path) or PID gains. Returns the rows of evaluation.csv and the
+    arrays of trajectories.npz: `length`, `success` (trials,), `error` in m, every trial's length + 1 values one after
+    another, and of the first PATHS trials `tcp` in m, alike, `goal` and `object` as the trial ended (n, 3)."""
     chunks = [(task, source, list(range(i, min(i + 10, trials)))) for i in range(0, trials, 10)]
     bar = dict(total=len(chunks), desc="trials / 10", disable=quiet or None, leave=False)
     if jobs == 1:
@@ -132,7 +144,11 @@ def run_trials(task, source, trials=500, jobs=1, quiet=False):
     else:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             parts = list(tqdm(pool.map(_trials, chunks), **bar))
-    return [row for part in parts for row in part]
+    rows, errors, paths = zip(*(done for part in parts for done in part), strict=True)
+    tcp, goal, cube = zip(*paths[:PATHS], strict=True)
+    trajectories = {"length": np.array([row["length"] for row in rows]), "error": np.concatenate(errors)}
+    trajectories |= {"success": np.array([row["success"] for row in rows], dtype=bool), "tcp": np.concatenate(tcp)}
+    return list(rows), trajectories | {"goal": np.array(goal), "object": np.array(cube)}
 
 
 def metrics(rows):
@@ -151,17 +167,70 @@ def metrics(rows):
     }
 
 
-def print_table(results):
-    """results: {name: rows of evaluation.csv}."""
-    print(f"{'agent':44s} trials  P_scs %    T_eff   R_test  E_95 cm  steps   failures")
+def intervals(rows):
+    """95 % intervals (low, high) of `metrics`: Wilson's for P_scs, Student's for means over the successful trials."""
+    from scipy import stats  # a second, which a training run need not spend
+
+    n = sum(row["success"] for row in rows)
+    low, high = stats.binomtest(n, len(rows)).proportion_ci(method="wilson")
+    found = {"P_scs_percent": (100 * low, 100 * high)}
+    for name, column in OF_SUCCESSFUL.items():
+        x = np.array([row[column] for row in rows if row["success"]])
+        half = stats.t.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n) if n > 1 else math.nan
+        found[name] = (metrics(rows)[name] - half, metrics(rows)[name] + half)
+    return found
+
+
+def sectors(rows):
+    """Success in percent by the quarter of the workspace the goal is in, from -180 degrees on; NaN for none there."""
+    quarter = [int((row["goal_theta"] + math.pi) // (math.pi / 2)) % 4 for row in rows]
+    mine = [[row["success"] for row, q in zip(rows, quarter, strict=True) if q == k] for k in range(4)]
+    return [100 * sum(won) / len(won) if won else math.nan for won in mine]
+
+
+def paired(rows, others):
+    """Differences rows - others on the same trials, {name: (mean, low, high)}, 95 % bootstrap intervals over trials:
+    success in percentage points over all trials, the other metrics over those that both agents succeeded in."""
+    from scipy import stats
+
+    pairs = list(zip(rows, others, strict=True))
+    both = [(a, b) for a, b in pairs if a["success"] and b["success"]]
+    differences = {"P_scs_percent": [100 * (a["success"] - b["success"]) for a, b in pairs]}
+    differences |= {name: [a[column] - b[column] for a, b in both] for name, column in OF_SUCCESSFUL.items()}
+    found = {}
+    for name, d in differences.items():
+        low = high = d[0] if d else math.nan
+        if len(set(d)) > 1:
+            resampled = stats.bootstrap((d,), np.mean, method="percentile", rng=np.random.default_rng(0))
+            low, high = resampled.confidence_interval
+        found[name] = (float(np.mean(d)) if d else math.nan, float(low), float(high))
+    return found
+
+
+def print_table(results, versus=None):
+    """results: {name: rows of evaluation.csv}; versus: the name that the others are compared with."""
+    width = max(24, *(len(name) for name in results))
+    cell = "{:5.{d}f} [{:.{d}f}, {:.{d}f}]".format
+    print(f"{'agent':{width}} trials  {'P_scs %':21}{'T_eff':20}{'R_test':21}{'E_95 cm':19}{'steps':16}failures")
     for name, rows in results.items():
-        m = metrics(rows)
+        m, ends = metrics(rows), intervals(rows)
+        cells = [cell(m[key], *ends[key], d=d).ljust(w) for key, d, w in CELLS]
         how = [row["failure"] for row in rows if row["failure"]]
         failures = ", ".join(f"{how.count(f)} {f}" for f in sorted(set(how))) or "none"
-        print(
-            f"{name:44s} {len(rows):6d} {m['P_scs_percent']:8.1f} {m['T_eff']:8.1f} {m['R_test']:8.2f} "
-            f"{m['E_95_cm']:8.2f} {m['steps']:6.0f}   {failures}"
-        )
+        print(f"{name:{width}} {len(rows):6d}  {''.join(cells)}{failures}")
+    print("[ ]: 95 % interval over trials (P_scs: Wilson; the others over the successful trials: Student)\n")
+    print("success % by the goal's quarter, theta in degrees:   [-180, -90)    [-90, 0)     [0, 90)   [90, 180)")
+    for name, rows in results.items():
+        print(f"{name:{width}}".ljust(51) + "".join(f"{share:12.1f}" for share in sectors(rows)))
+    for name in results if versus else ():
+        if name != versus:
+            print(f"\n{name} less {versus}, the same trials (95 % bootstrap interval over trials):")
+            for key, found in paired(results[name], results[versus]).items():
+                print(f"  {key:14}{cell(*found, d=2)}")
+
+
+OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length"}
+CELLS = [("P_scs_percent", 1, 21), ("T_eff", 1, 20), ("R_test", 2, 21), ("E_95_cm", 2, 19), ("steps", 0, 16)]
 
 
 def write_csv(path, rows):
@@ -172,21 +241,28 @@ def write_csv(path, rows):
     logx.atomic_write(path, lambda file: file.write(text.getvalue().encode()))
 
 
-def show(task, source, path=None, seed=FIRST_SEED):
-    """The first test trials of an agent: six into a GIF at `path`, or three in a window where it is None."""
+def write(folder, rows, trajectories):
+    """evaluation.csv and trajectories.npz in `folder`."""
+    write_csv(folder / "evaluation.csv", rows)
+    logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
+
+
+def show(agents, trials, path=None):
+    """Test trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
+    where it is None."""
     mode = dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
-    env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True, **mode)
-    pid = None if isinstance(source, Path) else pid_demo.PID(env, source)
-    act = load_policy(source) if pid is None else lambda s: pid.act()
+    made = {name: make_agent(*agent, **mode) for name, agent in agents.items()}
+    seeds = [FIRST_SEED + i for i in trials]
     if path:
-        pid_demo.film(env, act, path, episodes=6, seed=seed)
-    else:
-        for n in range(3):
-            s, _ = env.reset(seed=seed + n)
-            done = False
-            while not done:
-                s, _, terminated, truncated, _ = env.step(act(s))
-                done = terminated or truncated
+        pid_demo.film(made, path, seeds)
+        return
+    ((env, act),) = made.values()
+    for seed in seeds:
+        s, _ = env.reset(seed=seed)
+        done = False
+        while not done:
+            s, _, terminated, truncated, _ = env.step(act(s))
+            done = terminated or truncated
     env.close()
 
 
@@ -195,47 +271,74 @@ def main():
         description=__doc__, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
-    parser.add_argument("--pid", action="store_true", help="the PID demonstrator instead of a run")
+    parser.add_argument("--pid", action="store_true", help="the PID demonstrator too")
     parser.add_argument("--task", choices=TASKS, help="with --pid")
     parser.add_argument("--gains", choices=pid_demo.GAINS, default="authors", help="with --pid")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="with --pid: where its trials are written")
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
-    parser.add_argument("--gif", metavar="FILE", help="film six trials instead")
-    parser.add_argument("--watch", action="store_true", help="three trials in PyBullet's window instead")
+    parser.add_argument("--versus", type=Path, metavar="RUN", help="print paired differences from this run as well")
+    parser.add_argument("--gif", metavar="FILE", help="film trials instead, the agents side by side")
+    parser.add_argument("--mp4", metavar="FILE", help="the same as a video (pip install imageio imageio-ffmpeg)")
+    parser.add_argument("--watch", action="store_true", help="trials in PyBullet's window instead")
+    parser.add_argument("--show", type=int, nargs="+", default=[*range(6)], metavar="I", help="which trials (0 ... 5)")
     flags = parser.parse_args()
     for name in ("trials", "jobs"):
         if getattr(flags, name) < 1:
             parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
-    if flags.pid == bool(flags.runs):
-        parser.error("RUN or --pid --task T: name run folders or ask for the PID, not both")
+    if min(flags.show) < 0:
+        parser.error(f"--show {min(flags.show)}: must be at least 0")
+    if not (flags.pid or flags.runs):
+        parser.error("RUN or --pid --task T: name run folders, or ask for the PID")
     if flags.pid and not flags.task:
         parser.error(f"--pid: needs --task, one of {', '.join(TASKS)}")
-    if flags.gif and not Path(flags.gif).absolute().parent.is_dir():
-        parser.error(f"--gif {flags.gif}: its folder does not exist")
-    if (flags.gif or flags.watch) and len(flags.runs) > 1:
-        parser.error("--gif, --watch: one run at a time")
+    if flags.out and not flags.pid:
+        parser.error(f"--out {flags.out}: goes with --pid; a run's trials are written into its own folder")
+    film = flags.gif or flags.mp4
+    for name in ("gif", "mp4"):
+        path = getattr(flags, name)
+        if path and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
+            parser.error(f"--{name} {path}: is a folder, or its folder does not exist")
+    if flags.mp4 and not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg"))):
+        parser.error("--mp4: needs imageio and imageio-ffmpeg (pip install imageio imageio-ffmpeg), or use --gif")
+    if bool(flags.gif) + bool(flags.mp4) + flags.watch > 1:
+        parser.error("--gif, --mp4, --watch: one of them at a time")
     agents = {}
-    for folder in flags.runs:
+    for folder in [*flags.runs, *([flags.versus] if flags.versus else [])]:
         try:
             agents[str(folder)] = (load_policy(folder).task, folder)
         except ValueError as error:
             parser.error(str(error))
     if flags.pid:
         agents[f"PID, {flags.gains} gains, {flags.task}"] = (flags.task, flags.gains)
-    if flags.gif or flags.watch:
+    if flags.watch and len(agents) > 1:
+        parser.error("--watch: one agent at a time")
+    tasks = sorted({task for task, _ in agents.values()})
+    if len(tasks) > 1 and (flags.versus or film):
+        parser.error(f"--versus, --gif, --mp4: the agents must be of one task, not {' and '.join(tasks)}")
+    if film or flags.watch:
         try:
-            show(*next(iter(agents.values())), flags.gif)
+            show(agents, flags.show[:3] if flags.watch else flags.show, film)
         except ValueError as error:
             parser.error(str(error))
-        if flags.gif:
-            print(f"wrote {flags.gif}")
+        if film:
+            print(f"wrote {film}")
         return
     results = {}
     for name, (task, source) in agents.items():
-        results[name] = run_trials(task, source, flags.trials, flags.jobs)
-        if isinstance(source, Path):
-            write_csv(source / "evaluation.csv", results[name])
-    print_table(results)
+        results[name], trajectories = run_trials(task, source, flags.trials, flags.jobs)
+        try:
+            if isinstance(source, Path):
+                write(source, results[name], trajectories)
+            elif flags.out:
+                flags.out.mkdir(parents=True, exist_ok=True)
+                config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
+                text = json.dumps(config, indent=1).encode()
+                logx.atomic_write(flags.out / "config.json", lambda file, text=text: file.write(text))
+                write(flags.out, results[name], trajectories)
+        except OSError as error:
+            parser.error(f"{name}: its trials cannot be written ({error.strerror})")
+    print_table(results, str(flags.versus) if flags.versus else None)
 
 
 if __name__ == "__main__":

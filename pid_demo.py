@@ -184,25 +184,49 @@ def load_demos(path, task):
     return demos, meta
 
 
-def film(env, act, path, episodes=3, seed=0, every=4):
-    """Writes a GIF of `act(obs)` on an env with render_mode "rgb_array", one frame in `every` steps, in real time."""
+def frames(agents, seeds, every):
+    """The pictures (height, width, 3) uint8 of episodes, one in `every` steps, the agents' side by side.
+
+    agents: {name: (an env with render_mode "rgb_array", act(obs))}; the names are written on where there are several.
+    """
+    from PIL import Image, ImageDraw
+
+    for seed in seeds:
+        obs = {name: env.reset(seed=seed)[0] for name, (env, _) in agents.items()}
+        picture, t = {}, 0
+        while obs:  # those that have ended keep their last picture
+            for name, (env, act) in agents.items():
+                if name in obs and t % every == 0:
+                    picture[name] = env.render()
+                if name in obs:
+                    obs[name], _, terminated, truncated, _ = env.step(act(obs[name]))
+                    if terminated or truncated:
+                        picture[name] = env.render()
+                        del obs[name]
+            if t % every == 0 or not obs:
+                whole = Image.fromarray(np.concatenate([picture[name] for name in agents], axis=1))
+                for n, name in enumerate(agents if len(agents) > 1 else ()):
+                    ImageDraw.Draw(whole).text((n * whole.width // len(agents) + 6, 4), name, fill="black")
+                yield np.asarray(whole)
+            t += 1
+        yield from [np.asarray(whole)] * 9  # a rest at the end
+
+
+def film(agents, path, seeds, every=4):
+    """Writes `frames` to a GIF, or to an MP4 (with imageio's ffmpeg) where `path` says so, in real time."""
     from PIL import Image
 
-    frames = []
-    for n in range(episodes):
-        s, _ = env.reset(seed=seed + n)
-        done, t = False, 0
-        while not done:
-            if t % every == 0:
-                frames.append(env.render())
-            s, _, terminated, truncated, _ = env.step(act(s))
-            done, t = terminated or truncated, t + 1
-        frames += [env.render()] * 10  # a rest at the end
-    images = [Image.fromarray(frame).quantize(64) for frame in frames]
-    temporary = f"{path}.part"
-    images[0].save(
-        temporary, "GIF", save_all=True, append_images=images[1:], duration=int(1000 * TIME_STEP * every), loop=0
-    )
+    temporary, fps = Path(path).with_name(f".part-{Path(path).name}"), 1 / (TIME_STEP * every)
+    if str(path).endswith(".mp4"):
+        import imageio
+
+        with imageio.get_writer(temporary, fps=fps, macro_block_size=None) as video:
+            for picture in frames(agents, seeds, every):
+                video.append_data(picture)
+    else:
+        images = [Image.fromarray(picture).quantize(64) for picture in frames(agents, seeds, every)]
+        of_gif = dict(save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+        images[0].save(temporary, "GIF", **of_gif)
     os.replace(temporary, path)
 
 
@@ -264,7 +288,7 @@ def main():
             parser.error(f"--watch: {error}")
         pid = PID(env, gains, **way)
         if flags.gif:
-            film(env, lambda s: pid.act(), flags.gif, seed=flags.seed)
+            film({"PID": (env, lambda s: pid.act())}, flags.gif, [flags.seed + n for n in range(3)])
             print(f"wrote {flags.gif}")
         else:
             for n in range(3):

@@ -1,6 +1,8 @@
 """evaluate.py: trials by hand on a scripted environment, the same for every agent, and safe loading of policies."""
 
 import csv
+import importlib.util
+import json
 import math
 import pickle
 import sys
@@ -11,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import ddpg_demoease as ddpg
 import evaluate
@@ -65,7 +68,7 @@ class Scripted:
 
     def __init__(self, script, terminated, **last):
         self.script, self.terminated, self.last = script, terminated, last
-        self.unwrapped = SimpleNamespace(goal=[-0.3, 0.4, 0.5])
+        self.unwrapped = SimpleNamespace(goal=[-0.3, 0.4, 0.5], tcp=(0.0, 0.0, 0.0))
         self.seeds, self.actions = [], []
 
     def info(self, distance, effort, **more):
@@ -78,6 +81,7 @@ class Scripted:
 
     def step(self, action):
         self.actions.append(action)
+        self.unwrapped.tcp = (0.1 * (self.t + 1), 0.0, 0.5)
         distance, reward, effort = self.script[self.t]
         self.t += 1
         done = self.t == len(self.script)
@@ -89,7 +93,7 @@ def test_a_row_follows_by_hand():
     n = 41  # the last 5 % are 2.05 steps: 3
     script = [(0.9 - 0.02 * t, -0.01 * t, 0.1 + 0.001 * t) for t in range(n)]
     env = Scripted(script, True, is_success=True, grasped=True)
-    row, errors = evaluate.trial(env, lambda s: s.copy(), 7)
+    row, errors, path = evaluate.trial(env, lambda s: s.copy(), 7)
     assert list(row) == HEADER.split(",")
     assert row.pop("return") == pytest.approx(-0.01 * sum(range(n)))
     assert row.pop("effort_percent") == pytest.approx(100 * (0.1 + 0.001 * 20) / 2)  # of norm(tau_hat) <= 2
@@ -98,13 +102,14 @@ def test_a_row_follows_by_hand():
     assert row.pop("goal_theta") == pytest.approx(math.atan2(0.4, -0.3)) and row.pop("goal_rho") == pytest.approx(0.5)
     assert row == {"trial": 7, "success": 1, "failure": "", "grasped": 1, "length": n, "goal_z": 0.5}
     assert errors == pytest.approx([1.0] + [0.9 - 0.02 * t for t in range(n)])  # e_0 to e_T
+    np.testing.assert_allclose(path, [(0, 0, 0)] + [(0.1 * t, 0, 0.5) for t in range(1, n + 1)], rtol=1e-6)
     assert [a[0] for a in env.actions] == list(range(n))  # act saw each state once, in order
 
 
 @pytest.mark.parametrize("n, last", [(1, 1), (19, 1), (20, 1), (21, 2), (100, 5), (400, 20)])
 def test_e95_is_over_the_last_twentieth_of_the_steps_and_at_least_one(n, last):
     script = [(0.01 * (n - t), 0.0, 0.0) for t in range(n)]
-    row, _ = evaluate.trial(Scripted(script, False), lambda s: 0, 0)
+    row, *_ = evaluate.trial(Scripted(script, False), lambda s: 0, 0)
     assert row["e95_cm"] == pytest.approx(np.mean([k for k in range(1, last + 1)])) and row["length"] == n
 
 
@@ -117,7 +122,7 @@ def test_e95_is_over_the_last_twentieth_of_the_steps_and_at_least_one(n, last):
     (True, dict(is_success=True, collision="cube"), ""),
 ])  # fmt: skip
 def test_a_failure_is_named_by_what_ended_the_trial(terminated, last, failure):
-    row, _ = evaluate.trial(Scripted([(0.1, 0, 0), (0.1, 0, 0)], terminated, **last), lambda s: 0, 0)
+    row, *_ = evaluate.trial(Scripted([(0.1, 0, 0), (0.1, 0, 0)], terminated, **last), lambda s: 0, 0)
     assert row["failure"] == failure and row["success"] == int(failure == "")
     assert row["grasped"] == int(last.get("grasped", False))
 
@@ -147,14 +152,31 @@ def test_trial_i_is_the_same_goal_for_every_agent_and_after_any_other_trial(task
 
 def test_nothing_depends_on_the_number_of_jobs(run_folder):
     one, two = (evaluate.run_trials("p2p", run_folder, trials=11, jobs=jobs, quiet=True) for jobs in (1, 2))
-    assert one == two and [row["trial"] for row in one] == list(range(11))
-    assert len({row["e95_cm"] for row in one}) == 11
+    assert one[0] == two[0] and [row["trial"] for row in one[0]] == list(range(11))
+    assert len({row["e95_cm"] for row in one[0]}) == 11
+    assert one[1].keys() == two[1].keys()
+    for name in one[1]:
+        np.testing.assert_array_equal(one[1][name], two[1][name])
 
 
 def test_the_first_trials_of_a_longer_study_are_the_shorter_one():
-    rows = evaluate.run_trials("p2p", "fast", trials=12, quiet=True)
-    assert rows[:3] == evaluate.run_trials("p2p", "fast", trials=3, quiet=True) and len(rows) == 12
+    rows, _ = evaluate.run_trials("p2p", "fast", trials=12, quiet=True)
+    assert rows[:3] == evaluate.run_trials("p2p", "fast", trials=3, quiet=True)[0] and len(rows) == 12
     assert any(row["success"] for row in rows)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_trajectories_are_those_of_the_trials_one_after_another(monkeypatch, task):
+    monkeypatch.setattr(evaluate, "PATHS", 2)
+    rows, kept = evaluate.run_trials(task, "fast", trials=3, quiet=True)
+    assert kept["length"].tolist() == [row["length"] for row in rows]
+    assert kept["success"].tolist() == [bool(row["success"]) for row in rows]
+    ends = np.cumsum(kept["length"] + 1)
+    assert len(kept["error"]) == ends[-1] and len(kept["tcp"]) == ends[1] and kept["tcp"].shape[1] == 3
+    np.testing.assert_allclose(100 * kept["error"][ends - 1], [row["final_error_cm"] for row in rows], rtol=1e-5)
+    distance = np.linalg.norm(kept["tcp"] - np.repeat(kept["goal"], kept["length"][:2] + 1, axis=0), axis=1)
+    np.testing.assert_allclose(distance, kept["error"][: ends[1]], atol=1e-5)
+    assert kept["object"].shape == (2, 3) and np.isnan(kept["object"]).all() == (task == "p2p")
 
 
 def trial_row(success, **values):
@@ -169,12 +191,42 @@ def test_metrics_average_the_successful_trials_only():
     assert evaluate.metrics(rows) == {"P_scs_percent": 50, "T_eff": 15, "R_test": 9.25, "E_95_cm": 5, "steps": 120}
 
 
+def test_intervals_are_wilsons_for_success_and_students_for_the_means():
+    rows = [trial_row(1, effort_percent=x, length=100) for x in (10, 12, 14, 20)] + [trial_row(0)] * 6
+    found = evaluate.intervals(rows)
+    z, n, p = 1.959964, 10, 0.4
+    centre = (p + z**2 / 2 / n) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * math.sqrt(p * (1 - p) / n + z**2 / 4 / n**2)
+    assert found["P_scs_percent"] == pytest.approx((100 * (centre - half), 100 * (centre + half)), rel=1e-5)
+    half = 3.182446 * math.sqrt(56 / 3) / 2  # t of 3 degrees of freedom; squared deviations 16 + 4 + 0 + 36
+    assert found["T_eff"] == pytest.approx((14 - half, 14 + half), rel=1e-5)
+    assert found["steps"] == pytest.approx((100, 100))
+
+
+def test_success_is_counted_by_the_quarter_the_goal_is_in():
+    angles = [(-3.1, 1), (-1.6, 0), (-1.5, 1), (0.1, 0), (0.2, 0), (3.1, 1), (-math.pi, 1), (math.pi, 1)]
+    assert evaluate.sectors([trial_row(won, goal_theta=t) for t, won in angles])[:3] == [75, 100, 0]
+    assert math.isnan(evaluate.sectors([trial_row(1, goal_theta=-3.0)])[3])
+
+
+def test_paired_differences_are_over_the_same_trials_and_where_both_succeed():
+    one = [trial_row(1, length=100), trial_row(1, length=120), trial_row(0, length=400), trial_row(1, length=90)]
+    two = [trial_row(1, length=110), trial_row(0, length=400), trial_row(0, length=400), trial_row(1, length=130)]
+    found = evaluate.paired(one, two)
+    mean, low, high = found["P_scs_percent"]
+    assert mean == 25 and low == 0 and 50 <= high <= 75
+    mean, low, high = found["steps"]
+    assert (mean, low, high) == (-25, -40, -10)  # two pairs: the interval is all of them
+    assert evaluate.paired(one, one)["P_scs_percent"] == (0, 0, 0)
+    assert math.isnan(evaluate.paired(two[1:3], one[1:3])["T_eff"][0])
+
+
 def test_metrics_are_nan_and_the_table_still_prints_where_no_trial_succeeded(capsys):
     rows = [trial_row(0), trial_row(0, failure="timeout"), trial_row(0)]
     m = evaluate.metrics(rows)
     assert m.pop("P_scs_percent") == 0 and len(m) == 4 and all(math.isnan(value) for value in m.values())
     evaluate.print_table({"an agent": rows})
-    line = capsys.readouterr().out.splitlines()[-1]
+    line = capsys.readouterr().out.splitlines()[1]
     assert line.split()[:4] == ["an", "agent", "3", "0.0"] and line.endswith("2 self, 1 timeout")
 
 
@@ -290,10 +342,10 @@ def test_a_study_of_a_run_prints_its_row_and_writes_every_trial(tmp_path, monkey
     assert main(monkeypatch, folder, "--trials", 3) == 0
     out = capsys.readouterr().out.splitlines()
     assert out[0].split()[0] == "agent" and out[1].split()[:2] == [str(folder), "3"]
-    assert sorted(path.name for path in folder.iterdir()) == ["evaluation.csv", "policy.pt"]  # and no half of a file
+    assert sorted(path.name for path in folder.iterdir()) == ["evaluation.csv", "policy.pt", "trajectories.npz"]
     text = (folder / "evaluation.csv").read_bytes().decode()
     assert text.startswith(HEADER + "\n") and text.count("\n") == 4 and "\r" not in text
-    for written, row in zip(csv.DictReader(text.splitlines()), evaluate.run_trials("p2p", folder, 3, quiet=True),
+    for written, row in zip(csv.DictReader(text.splitlines()), evaluate.run_trials("p2p", folder, 3, quiet=True)[0],
                             strict=True):  # fmt: skip
         assert written["failure"] == row.pop("failure")
         assert {name: float(written[name]) for name in row} == pytest.approx(row, rel=1e-5)
@@ -315,7 +367,15 @@ def test_a_study_of_several_runs_gives_each_its_own_file(tmp_path, monkeypatch, 
     assert main(monkeypatch, *folders, "--trials", 1) == 0
     rows = [(folder / "evaluation.csv").read_text() for folder in folders]
     assert rows[0] != rows[1] and all(row.count("\n") == 2 for row in rows)
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == [str(f) for f in folders]
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]] == [str(f) for f in folders]
+
+
+def test_a_study_versus_another_run_prints_the_paired_differences(tmp_path, monkeypatch, capsys):
+    one, two = (saved(tmp_path / name, learner(seed=n).policy()) for n, name in enumerate(("a", "b")))
+    assert main(monkeypatch, one, "--versus", two, "--trials", 2) == 0
+    out = capsys.readouterr().out
+    assert f"{one} less {two}, the same trials" in out and "P_scs_percent  0.00 [0.00, 0.00]" in out
+    assert (two / "evaluation.csv").exists()
 
 
 def test_a_study_of_the_demonstrator_prints_its_row(monkeypatch, capsys):
@@ -324,9 +384,37 @@ def test_a_study_of_the_demonstrator_prints_its_row(monkeypatch, capsys):
     assert line.startswith("PID, fast gains, p2p") and line.split()[4] == "2"
 
 
+def test_trials_of_the_demonstrator_are_kept_where_a_folder_is_given(tmp_path, monkeypatch):
+    out = tmp_path / "pid-p2p-fast"
+    assert main(monkeypatch, "--pid", "--task", "p2p", "--gains", "fast", "--trials", 2, "--out", out) == 0
+    config = json.loads((out / "config.json").read_text())
+    assert (config["task"], config["algo"], config["gains"]) == ("p2p", "pid", "fast")
+    assert (out / "evaluation.csv").read_text().count("\n") == 3
+    with np.load(out / "trajectories.npz", allow_pickle=False) as kept:
+        assert len(kept["length"]) == 2
+
+
+def test_agents_are_filmed_side_by_side_on_the_trials_chosen(tmp_path, monkeypatch):
+    folder, make, seeds = saved(tmp_path / "run", learner().policy()), gymnasium.make, []
+
+    def short_make(id_, **settings):
+        env = make(id_, **(settings | {"width": 32, "height": 24, "max_episode_steps": 5}))
+        reset = env.reset
+        env.reset = lambda seed: seeds.append(seed) or reset(seed=seed)
+        return env
+
+    monkeypatch.setattr(gymnasium, "make", short_make)
+    words = [folder, "--pid", "--task", "p2p", "--gif", tmp_path / "both.gif", "--show", 4, 2]
+    assert main(monkeypatch, *words) == 0
+    assert seeds == [1_000_004, 1_000_004, 1_000_002, 1_000_002]
+    with Image.open(tmp_path / "both.gif") as image:
+        assert image.size == (64, 24) and image.n_frames > 1
+    assert main(monkeypatch, folder, "--mp4", tmp_path / "one.mp4", "--show", 0) in (0, 2)
+    assert (tmp_path / "one.mp4").exists() == bool(importlib.util.find_spec("imageio_ffmpeg"))
+
+
 BAD = {
     "neither a run nor the PID": ([], "--pid"),
-    "a run and the PID": (["{run}", "--pid", "--task", "p2p"], "--pid"),
     "the PID without a task": (["--pid"], "--task"),
     "an unknown task": (["--pid", "--task", "p3p"], "--task"),
     "unknown gains": (["--pid", "--task", "p2p", "--gains", "x"], "--gains"),
@@ -339,7 +427,13 @@ BAD = {
     "a run and an unknown folder": (["{run}", "{tmp}/nowhere"], "nowhere"),
     "an unknown flag": (["{run}", "--nonsense"], "--nonsense"),
     "a GIF in no folder": (["{run}", "--gif", "{tmp}/nowhere/a.gif"], "--gif"),
-    "a GIF of two runs": (["{run}", "{run}", "--gif", "{tmp}/a.gif"], "--gif"),
+    "a GIF of two tasks": (["{run}", "--pid", "--task", "pnp", "--gif", "{tmp}/a.gif"], "--gif"),
+    "two tasks compared": (["--pid", "--task", "pnp", "--versus", "{run}"], "--versus"),
+    "a window for two": (["{run}", "--pid", "--task", "p2p", "--watch"], "--watch"),
+    "a film twice": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
+    "a trial before the first": (["{run}", "--gif", "{tmp}/a.gif", "--show", "-1"], "--show"),
+    "a folder for a run's trials": (["{run}", "--out", "{tmp}/out"], "--out"),
+    "an unknown run to compare with": (["{run}", "--versus", "{tmp}/nowhere"], "nowhere"),
     "missing": (["{tmp}/bad"], "policy.pt"),
     "truncated": (["{tmp}/bad"], "policy.pt"),
     "pickled object": (["{tmp}/bad"], "policy.pt"),

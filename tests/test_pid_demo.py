@@ -522,7 +522,7 @@ def test_film_is_a_gif_of_the_episodes_in_real_time_with_frames_that_differ(make
         seen.append(obs)
         return np.array([1, 0, 0, 0], dtype=np.float32)
 
-    film(env, act, path, episodes=2, seed=3, every=4)
+    film({"arm": (env, act)}, path, seeds=[3, 4], every=4)
     assert list(tmp_path.iterdir()) == [path]
     assert len(seen) == 16
     np.testing.assert_array_equal(seen[0], env.reset(seed=3)[0])
@@ -551,7 +551,7 @@ def test_gif_option_films_the_pid_on_the_task_asked(monkeypatch, tmp_path, capsy
         return make(id_, **(settings | {"width": 32, "height": 24, "max_episode_steps": 5}))
 
     monkeypatch.setattr(gymnasium, "make", short_make)
-    monkeypatch.setattr(pid_demo, "film", lambda *a, **k: whole(*a, **(k | {"episodes": 1})))
+    monkeypatch.setattr(pid_demo, "film", lambda agents, path, seeds: whole(agents, path, seeds[:1]))
     run(monkeypatch, "--task", task, "--gif", path, "--gains", "fast", "--stage", "train")
     assert made == [(TASKS[task].env_id, "rgb_array", "train")]
     assert str(path) in capsys.readouterr().out
