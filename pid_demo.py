@@ -23,11 +23,11 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
-from kinova_env import EPSILON, OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, tcp, wrap
+from kinova_env import EPSILON, OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 
-CLEARANCE = 0.15  # m, of way points: above the cube on P2P-O, before it (at most) on P&P
-RETRACT = 0.35  # m, radius to which it draws back before it rises beside a cube on P2P-O
-RADIUS = 0.05  # m, within which a way point counts as reached
+CLEARANCE = {"obstacle": 0.18, "object": 0.15}  # m, of the way above the cube on P2P-O, before it (at most) on P&P
+RETRACT = 0.3  # m, radius to which it draws back before it rises beside a cube on P2P-O
+RADIUS = 0.1  # m, over which one part of the way over P2P-O's cube becomes the next
 NOISE_KEPT = 0.9  # of the noise of one step in the next, 20 ms later
 GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
 
@@ -41,27 +41,31 @@ class PID:
     saturated (anti-windup). clearance, radius, retract: of the way points, in m.
     """
 
-    def __init__(self, env, gains="authors", clearance=CLEARANCE, radius=RADIUS, retract=RETRACT):
+    def __init__(self, env, gains="authors", clearance=None, radius=RADIUS, retract=RETRACT):
         self.env = env.unwrapped
         self.K_P, self.K_D, self.K_I = GAINS[gains] if isinstance(gains, str) else gains
-        self.clearance, self.radius, self.retract = clearance, radius, retract
+        self.clearance = CLEARANCE.get(self.env.row.cube) if clearance is None else clearance
+        self.radius, self.retract = radius, retract
         self._episode = None
 
-    def _plan(self):
-        """The episode's set points, in order: [(name, (M, 4) postures to choose from)] (`sec:demo`)."""
-        env = self.env
-        goal = ("goal", postures(env.goal))
-        if env.row.cube == "obstacle":  # rise above the cube, cross, descend
-            x, y, z = env.tcp
-            height = max(z, env.goal[2], env.cube[2] + self.clearance)
-            cross = ("cross", postures((*env.goal[:2], height)))
-            if math.dist((x, y), env.cube[:2]) > self.clearance:
-                return [("rise", postures((x, y, height))), cross, goal]
-            x, y = x * self.retract / math.hypot(x, y), y * self.retract / math.hypot(x, y)  # no room: draw back
-            return [("retract", postures((x, y, z))), ("rise", postures((x, y, height))), cross, goal]
-        if env.row.cube == "object":
-            return [("grasp", self._approach()), goal]
-        return [goal]
+    def _over(self):
+        """A posture on the way over P2P-O's cube (`sec:demo`): rise above it, cross, descend, blended over `radius`;
+        first draw back where a rise would meet the cube. A function of the state, not of what was reached before.
+        """
+        (x, y, z), (x_g, y_g, z_g), (x_o, y_o, z_o) = self.env.tcp, self.env.goal, self.env.cube
+        to_go = math.dist((x, y), (x_g, y_g)) / self.radius
+        height = z_g + max(0, z_o + self.clearance - z_g) * min(1, max(0, to_go - 1))
+        found = postures((x_g, y_g, height))
+        cross = self._nearest(found if len(found) else postures(self.env.goal))
+        below = min(1, max(0, (height - z) / self.radius))
+        close = min(1, max(0, (self.clearance - math.dist((x, y), (x_o, y_o))) / self.radius))
+        back = 1 + (self.retract / math.hypot(x, y) - 1) * close
+        found = postures((x * back, y * back, z + (height - z) * (1 - close)))
+        if not below or not len(found):
+            return cross
+        way = self._nearest(found) - cross
+        way[0] = wrap(way[0])
+        return cross + below * way
 
     def _approach(self):
         """Postures that grasp on the cube's horizontal axis, as far before its point EPSILON behind the cube as the TCP
@@ -83,26 +87,16 @@ class PID:
         q = np.array(self.env.q)
         return found[np.argmin(wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1))]
 
-    def _next(self):
-        """Takes the next set point."""
-        self._name, found = self._points.pop(0)
-        if len(found):
-            self._q_sp = self._nearest(found)
-            self._at = np.array(tcp(self._q_sp))
-            self._integral = np.zeros(4)
-        else:  # out of reach: a way point is left out (the goal never is)
-            self._next()
-
     def act(self):
         if self._episode != self.env.episode:
-            self._episode, self._points = self.env.episode, self._plan()
-            self._next()
-        while self._points and (
-            self.env.grasped if self._name == "grasp" else math.dist(self._at, self.env.tcp) < self.radius
-        ):
-            self._next()
-        if self._name == "grasp":
+            self._episode, self._goal, self._integral = self.env.episode, None, np.zeros(4)
+        if self.env.row.cube == "obstacle":
+            self._q_sp = self._over()
+        elif self.env.row.cube == "object" and not self.env.grasped:
             self._q_sp = self._nearest(self._approach())
+        elif self._goal is None:
+            self._q_sp = self._goal = self._nearest(postures(self.env.goal))
+            self._integral = np.zeros(4)
         q_tilde = self._q_sp - self.env.q
         q_tilde[0] = wrap(q_tilde[0])  # joint 1 turns without end: the shortest way round
         integral = self._integral + q_tilde * TIME_STEP
@@ -244,10 +238,10 @@ def main():
     parser.add_argument("--gains", choices=GAINS, default="authors")
     for name, i in (("K_P", 0), ("K_D", 1), ("K_I", 2)):
         parser.add_argument(f"--{name}", type=float, help=f"instead of that of --gains ({GAINS['authors'][i]})")
-    for name, value, what in (("clearance", CLEARANCE, "of way points above the cube (P2P-O), before it (P&P)"),
-                              ("retract", RETRACT, "radius to draw back to where a rise would meet the cube (P2P-O)"),
-                              ("radius", RADIUS, "within which a way point counts as reached")):  # fmt: skip
-        parser.add_argument(f"--{name}", type=float, default=value, metavar="M", help=f"{what}, in m ({value})")
+    for name, value, what in (("clearance", None, "of the way above the cube (P2P-O, 0.18), before it (P&P, 0.15)"),
+                              ("retract", RETRACT, f"radius to draw back to beside a cube (P2P-O, {RETRACT})"),
+                              ("radius", RADIUS, f"over which the parts of P2P-O's way blend ({RADIUS})")):  # fmt: skip
+        parser.add_argument(f"--{name}", type=float, default=value, metavar="M", help=f"{what}, in m")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of noise on recorded actions")
     parser.add_argument("--stage", choices=STAGES, default="demo")
     parser.add_argument("--symmetry", choices=("none", "gas"), default="none", help="gas: record one partition, map it")
@@ -274,7 +268,7 @@ def main():
     if min(gains) < 0 or not np.all(np.isfinite(gains)):
         parser.error(f"--K_P --K_D --K_I {gains}: must be finite and not negative")
     for name, low, high in (("clearance", 0, 0.5), ("retract", 0.1, 1), ("radius", 0.001, 0.5), ("noise", 0, 10)):
-        if not low <= getattr(flags, name) <= high:
+        if getattr(flags, name) is not None and not low <= getattr(flags, name) <= high:
             parser.error(f"--{name} {getattr(flags, name)}: must be at least {low} and at most {high}")
     way = {name: getattr(flags, name) for name in ("clearance", "radius", "retract")}
 

@@ -874,11 +874,12 @@ def test_gas_needs_a_real_episode_for_every_k_demonstrations_and_the_others_one_
 def test_quick_ends_with_test_trials_of_the_agent_and_of_the_demonstrator_and_a_film(tmp_path, monkeypatch, capsys):
     trials, shown = evaluate.run_trials, []
     monkeypatch.setattr(evaluate, "run_trials", lambda task, source, n, **kw: trials(task, source, 2, quiet=True))
-    monkeypatch.setattr(evaluate, "show", lambda task, source, path: shown.append((task, source, path)))
+    monkeypatch.setattr(evaluate, "show", lambda agents, trials, path: shown.append((agents, list(trials), path)))
     argv = "ddpg_demoease.py --quick --quiet --epochs 1 --steps_per_epoch 20 --num_demos 1 --hidden_sizes 8 --name q"
     monkeypatch.setattr("sys.argv", [*argv.split(), "--max_ep_len", "20", "--data_dir", str(tmp_path)])
     ddpg.main()
     out = capsys.readouterr().out
     assert len(rows_of(tmp_path / "q" / "evaluation.csv")) == 2
     assert str(tmp_path / "q") in out and "PID, fast gains" in out
-    assert shown == [("p2p", tmp_path / "q", tmp_path / "q" / "agent.gif")]
+    folder = tmp_path / "q"
+    assert shown == [({str(folder): ("p2p", folder)}, list(range(6)), folder / "agent.gif")]

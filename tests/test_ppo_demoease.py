@@ -1137,7 +1137,7 @@ def test_a_run_that_turns_nan_stops_with_3_and_keeps_its_last_checkpoint(world, 
 def test_quick_ends_with_test_trials_of_the_agent_and_of_the_demonstrator_and_a_film(tmp_path, monkeypatch, capsys):
     trials, shown = evaluate.run_trials, []
     monkeypatch.setattr(evaluate, "run_trials", lambda task, source, n, **kw: trials(task, source, 1, quiet=True))
-    monkeypatch.setattr(evaluate, "show", lambda task, source, path: shown.append((task, source, path)))
+    monkeypatch.setattr(evaluate, "show", lambda agents, trials, path: shown.append((agents, list(trials), path)))
     argv = "ppo_demoease.py --task p2p --quick --quiet --epochs 1 --steps_per_epoch 20 --num_demos 1 --hidden_sizes 8 "
     argv += f"--train_iters 2 --clone_iters 2 --max_ep_len 20 --eval_every 0 --name q --data_dir {tmp_path}"
     monkeypatch.setattr("sys.argv", argv.split())
@@ -1145,4 +1145,5 @@ def test_quick_ends_with_test_trials_of_the_agent_and_of_the_demonstrator_and_a_
     out = capsys.readouterr().out
     assert len(rows_of(tmp_path / "q" / "evaluation.csv")) == 1
     assert str(tmp_path / "q") in out and "PID, fast gains" in out
-    assert shown == [("p2p", tmp_path / "q", tmp_path / "q" / "agent.gif")]
+    folder = tmp_path / "q"
+    assert shown == [({str(folder): ("p2p", folder)}, list(range(6)), folder / "agent.gif")]
