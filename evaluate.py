@@ -211,7 +211,7 @@ def print_table(results, versus=None):
     """results: {name: rows of evaluation.csv}; versus: the name that the others are compared with."""
     width = max(24, *(len(name) for name in results))
     cell = "{:5.{d}f} [{:.{d}f}, {:.{d}f}]".format
-    print(f"{'agent':{width}} trials  {'P_scs %':21}{'T_eff':20}{'R_test':21}{'E_95 cm':19}{'steps':16}failures")
+    print(f"{'agent':{width}} trials  {'P_scs %':21}{'T_eff':20}{'R_test':21}{'E_95 cm':19}{'steps':18}failures")
     for name, rows in results.items():
         m, ends = metrics(rows), intervals(rows)
         cells = [cell(m[key], *ends[key], d=d).ljust(w) for key, d, w in CELLS]
@@ -230,7 +230,7 @@ def print_table(results, versus=None):
 
 
 OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length"}
-CELLS = [("P_scs_percent", 1, 21), ("T_eff", 1, 20), ("R_test", 2, 21), ("E_95_cm", 2, 19), ("steps", 0, 16)]
+CELLS = [("P_scs_percent", 1, 21), ("T_eff", 1, 20), ("R_test", 2, 21), ("E_95_cm", 2, 19), ("steps", 0, 18)]
 
 
 def write_csv(path, rows):

@@ -510,6 +510,42 @@ def test_command_line_records_and_exits_0_and_says_what_is_wrong_with_2(tmp_path
     assert len(lines) == 1 and "--K_P" in lines[0]
 
 
+@pytest.mark.parametrize("task", ["p2po", "pnp"])
+def test_way_past_or_to_the_cube_depends_on_the_state_alone_not_on_what_was_reached_before(make, task):
+    env = make(task, stage="test")
+    pid, compared = PID(env, "fast"), 0
+    rng = np.random.default_rng(0)
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(150):
+            a = pid.act()
+            if not env.unwrapped.grasped:
+                assert np.array_equal(PID(env, "fast").act(), a)
+                compared += 1
+            if env.step(np.clip(a + 0.3 * rng.standard_normal(4), -1, 1).astype(np.float32))[2]:
+                break
+    assert compared > 200
+
+
+def test_way_over_the_cube_rises_before_it_crosses_and_crosses_before_it_descends(make):
+    env = make("p2po")
+    start, goal, cube = (0.0, 0.52, 0.42), (-0.7, 0.5, 0.4), (-0.35, 0.5, 0.42)
+    env.reset(seed=0, options={"start": start, "goal": goal, "object": cube})
+    pid, path = PID(env, "fast"), []
+    for _ in range(400):
+        path.append(env.unwrapped.tcp)
+        _, _, terminated, truncated, info = env.step(pid.act())
+        if terminated or truncated:
+            break
+    assert info["is_success"]
+    x, y, z = np.array(path).T
+    over = np.hypot(x - env.unwrapped.cube[0], y - env.unwrapped.cube[1]) < 0.06
+    assert over.any() and z[over].min() > 0.42 + 0.1
+    risen = np.argmax(z > 0.42 + 0.1)
+    assert abs(np.arctan2(y, x)[:risen]).max() < 0.3 * 0.7  # of the way round
+    assert z.max() < 0.42 + 0.18 + 0.05 and z[-1] < 0.42 + 0.05
+
+
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
