@@ -43,7 +43,6 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure  # without pyplot: a PNG is then always drawn by Agg, no display needed
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Wedge
 from scipy.stats import bootstrap, trim_mean
 
 HERE = Path(__file__).resolve().parent
@@ -576,8 +575,8 @@ def learning_figure(task, runs):
 
 
 def error_figure(task, runs):
-    """Figures fig:p2p_errors, fig:p2po_errors, fig:pnp_errors: ||e_t|| over the successful test trials, a panel for each
-    of the paper's six columns. A trial that has ended keeps its last error, so that each counts alike at every t."""
+    """Figures fig:p2p_errors, fig:p2po_errors, fig:pnp_errors: ||e_t|| over the successful test trials, a panel for
+    each of the paper's six columns. A trial that has ended keeps its last error, so that each counts alike at every t."""
     runs = [run for run in runs if (run.path / "trajectories.npz").exists()]
     columns, groups = all_columns("test", task, runs), groups_of(runs)
     figure = Figure(figsize=(3.6, 4.8), layout="constrained")
@@ -674,20 +673,21 @@ def trajectories_figure(task, runs):
 
 def random_path(rng, sectors, K):
     """A 2-D path as fig:partitions has it: a random way point (theta, rho) in each of these sectors out of K, linear in
-    between in cylinder coordinates. Returns (M, 2) points x, y in m."""
+    between in cylinder coordinates. Returns (M, 2) points x, y in m; the way points are every 50th."""
     theta = 2 * math.pi / K * (np.asarray(sectors) + rng.random(len(sectors)))
     rho = rng.uniform(INNER, OUTER, len(sectors))
-    t = np.linspace(0, len(sectors) - 1, 50 * len(sectors))
+    t = np.linspace(0, len(sectors) - 1, 50 * (len(sectors) - 1) + 1)
     theta, rho = np.interp(t, np.arange(len(sectors)), theta), np.interp(t, np.arange(len(sectors)), rho)
     return np.stack([rho * np.cos(theta), rho * np.sin(theta)], axis=-1)
 
 
-def path_lengths(K, paths=2000, seed=0):
+def path_lengths(K, paths=1000, seed=0):
     """Lengths (paths,) in m of random demonstrations, from a point of a sector to another of the same, and of random
     regular paths, from one sector to the furthest opposite one with a way point in each between. K = 1: the same."""
     rng = np.random.default_rng(seed)
-    return [np.array([np.linalg.norm(np.diff(random_path(rng, sectors, K), axis=0), axis=1).sum() for _ in range(paths)])
-            for sectors in ([0, 0], [0, 0] if K == 1 else range(K // 2 + 1))]
+    demos, regular = (np.array([np.linalg.norm(np.diff(random_path(rng, sectors, K), axis=0), axis=1).sum()
+                                for _ in range(paths)]) for sectors in ([0, 0], range(K // 2 + 1)))
+    return demos, demos if K == 1 else regular
 
 
 def partitions_figure(task=None, runs=None):
@@ -701,14 +701,13 @@ def partitions_figure(task=None, runs=None):
     for k in range(4):
         x, y = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
         left.plot([INNER * x, OUTER * x], [INNER * y, OUTER * y], color="#555555", linewidth=0.8, linestyle=(0, (4, 2)))
-        for n in range(2):
-            path = random_path(rng, [k, k], 4)
-            left.plot(*path.T, color=COLOURS[0], linewidth=1, label=r"demonstrations $\tau^d$" * (k == n == 0) or None)
-            left.plot(*path[-1], "*", color=COLOURS[0], markersize=5)
-    for n in range(2):
-        path = random_path(rng, range(3), 4)
-        left.plot(*path.T, color=COLOURS[1], linewidth=1.3, label=r"regular paths $\tau$" * (n == 0) or None)
-        left.plot(*path[-1], "*", color=COLOURS[1], markersize=6)
+    for colour, label, routes in ((COLOURS[0], r"demonstrations $\tau^d$", [[k, k] for k in (0, 1, 2, 3) * 2]),
+                                  (COLOURS[1], r"regular paths $\tau$", [range(3), range(2, 5)])):
+        for sectors in routes:
+            path = random_path(rng, sectors, 4)
+            left.plot(*path.T, color=colour, linewidth=1.2, label=label if sectors == routes[0] else None)
+            left.plot(*path[:-1:50].T, "o", color=colour, markersize=2.5)
+            left.plot(*path[-1], "*", color=colour, markersize=6)
     left.set(aspect="equal", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5], xlabel="$x$ (m)", ylabel="$y$ (m)")
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, columnspacing=0.8, handlelength=1.4)
     K, lengths = np.arange(1, 13), [path_lengths(K) for K in range(1, 13)]
@@ -721,7 +720,7 @@ def partitions_figure(task=None, runs=None):
                            alpha=0.18, linewidth=0)
     right.axvspan(3.6, 4.4, color="#CC79A7", alpha=0.3, linewidth=0, label="$K=4$")
     right.set(xlabel="number of partitions $K$", ylabel="length", xticks=K, ylim=(0, None))
-    right.legend(title="mean and middle half\nof 2,000 random paths")
+    right.legend(title="mean and middle half\nof 1,000 random paths")
     return figure
 
 
@@ -729,8 +728,8 @@ def workspace_figure(task=None, runs=None):
     """Figure fig:workspace: the arm in the tube of reachable rho and z, which is drawn over PyBullet's picture."""
     import gymnasium
 
+    from kinova_env import ACTIVE_JOINTS, pybullet
     from kinova_env import TASKS as ENVS
-    from kinova_env import pybullet
 
     env = gymnasium.make(ENVS["p2p"].env_id, render_mode="rgb_array", disable_env_checker=True).unwrapped
     env.reset(seed=0, options={"start": (-math.pi / 4, 0.52, 0.42), "goal": (2.4, 0.6, 0.5)})
@@ -742,6 +741,7 @@ def workspace_figure(task=None, runs=None):
         physicsClientId=client)
     robot = np.reshape(link, (height, width)) == env._robot
     image = np.reshape(rgba, (height, width, 4)).astype(np.uint8)
+    joints = {joint: pybullet.getLinkState(env._robot, joint, physicsClientId=client)[4] for joint in ACTIVE_JOINTS}
     env.close()
     camera = np.reshape(lens, (4, 4)).T @ np.reshape(view, (4, 4)).T
 
@@ -758,14 +758,24 @@ def workspace_figure(task=None, runs=None):
     to_camera = math.radians(20 - 90)  # azimuth of the camera, seen from the base
     for radius in (INNER, OUTER):
         for a, b in zip(theta[:-1], theta[1:], strict=True):
-            behind = math.cos((a + b) / 2 - to_camera) < 0
+            over = radius == OUTER and math.cos((a + b) / 2 - to_camera) > 0
             corners = [(radius * math.cos(angle), radius * math.sin(angle), z)
                        for angle, z in ((a, LOW), (b, LOW), (b, HIGH), (a, HIGH))]
             x, y = pixels(np.array(corners)).T
-            ax.fill(x, y, color="#009E73", alpha=0.14, linewidth=0, zorder=1 if behind else 3)
-            for i, j in ((0, 1), (2, 3)):
-                ax.plot(x[[i, j]], y[[i, j]], color="#00664B", linewidth=0.8, zorder=1 if behind else 3)
-    ax.set(xlim=(0, width), ylim=(height, 0))
+            ax.fill(x, y, color="#009E73", alpha=0.12, linewidth=0, zorder=3 if over else 1)
+            for i in (0, 2):
+                ax.plot(x[i:i + 2], y[i:i + 2], color="#00664B", linewidth=0.8, zorder=3 if over else 1)
+    for name, radius in ((r"$\rho=0.3$ m", INNER), (r"$\rho=0.7$ m", OUTER)):
+        x, y = pixels(np.array([[radius * math.cos(to_camera + 0.9), radius * math.sin(to_camera + 0.9), HIGH]]))[0]
+        ax.text(x, y - 12, name, ha="center", va="bottom", fontsize=7, zorder=4)
+    for name, z in (("$z=0.25$ m", LOW), ("$z=0.65$ m", HIGH)):
+        x, y = pixels(np.array([[-OUTER * math.sin(to_camera), OUTER * math.cos(to_camera), z]]))[0]
+        ax.text(x + 15, y, name, va="center", fontsize=7, zorder=4)
+    for n, joint in enumerate(ACTIVE_JOINTS, start=1):
+        x, y = pixels(np.array([joints[joint]]))[0]
+        ax.annotate(f"#{n}", (x, y), (x - 170, y - 40), va="center", ha="right", fontsize=7.5, zorder=5,
+                    arrowprops={"arrowstyle": "-", "linewidth": 0.6})
+    ax.set(xlim=(80, width + 130), ylim=(height - 200, 150))
     ax.axis("off")
     return figure
 
@@ -785,23 +795,162 @@ def save_figure(flag, name, task, runs, paths):
 
 # ------------------------------------------------------------------------------------------ publishing
 
+def without_folders(value):
+    """A JSON value whose texts have lost their folders: no path of a machine is published."""
+    if isinstance(value, dict):
+        return {key: without_folders(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_folders(item) for item in value]
+    return "=".join(Path(part).name for part in value.split("=")) if isinstance(value, str) and "/" in value else value
+
+
+def check_whole(run, config):
+    """Exits with 2 and a line that names the run where it is of no clean commit or its files do not fit together."""
+    commit = str(config.get("versions", {}).get("git_commit"))
+    if run.column != PID or "versions" in config:
+        if not re.fullmatch("[0-9a-f]{40}", commit):
+            fail(f"--publish {run.path}: made with git commit {commit!r}; a clean one of 40 hex digits is expected")
+    if run.column != PID:
+        episodes = read_csv(run.path / "episodes.csv", ("env_steps", "length"))
+        progress = read_csv(run.path / "progress.csv", ("epoch", "env_steps"))
+        steps, last = episodes["env_steps"], progress["env_steps"][-1:].sum()
+        # an episode may be under way at the end of the last epoch, and a killed run has episodes after it
+        around = episodes["length"].max(initial=0) + config.get("max_ep_len", 1000), config["steps_per_epoch"]
+        if not (np.array_equal(steps, np.cumsum(episodes["length"])) and len(steps)
+                and np.array_equal(progress["epoch"], np.arange(1, len(progress["epoch"]) + 1))
+                and last - around[0] <= steps[-1] <= last + around[1]):
+            fail(f"--publish {run.path}: episodes.csv and progress.csv do not fit together; a run's own are expected")
+    if (run.path / "trajectories.npz").exists():
+        trials = read_npz(run.path / "trajectories.npz", ("length", "success"))
+        read_errors(run.path / "trajectories.npz"), read_paths(run.path / "trajectories.npz")
+        if not run.trials or any(not np.array_equal(trials[name], run.trials[name]) for name in trials):
+            fail(f"--publish {run.path}: trajectories.npz is not of the trials in evaluation.csv; run evaluate.py again")
+    elif run.column == PID and not run.trials:
+        fail(f"--publish {run.path}: no evaluation.csv; run evaluate.py --pid first")
+
+
+def publish_run(folder):
+    """Puts a whole run, from a clean commit, at RESULTS/NAME in place of what is there."""
+    config = read_config(folder / "config.json")
+    run = read_run(folder, config)
+    check_whole(run, config)
+    config = without_folders({key: value for key, value in config.items() if run.column != PID or key != "quick"})
+    config |= {"data_dir": "data/runs"} if run.column != PID else {}
+    files = {"config.json": json.dumps(config, indent=1).encode()}
+    for name in ("episodes.csv", "progress.csv", "evaluation.csv"):
+        for path in (folder / name, folder / f"{name}.gz"):
+            if path.exists() and name + ".gz" not in files:
+                data = path.read_bytes() if path.suffix == ".csv" else gzip.decompress(path.read_bytes())
+                files[name + ".gz"] = gzip.compress(data, mtime=0)  # the same bytes each time
+    for name in ("trajectories.npz", "policy.pt"):
+        if (folder / name).exists():
+            files[name] = (folder / name).read_bytes()
+    if "policy.pt" in files:
+        import logx  # not above: it takes torch along
+        try:
+            logx.load_torch(folder / "policy.pt")
+        except ValueError as error:
+            fail(f"--publish {error}; weights alone are expected")
+    elif run.column != PID and not folder.resolve().is_relative_to(RESULTS.resolve()):
+        fail(f"--publish {folder}: no policy.pt; a run with a checkpoint is expected")
+    target = RESULTS / folder.resolve().name
+    temporary = RESULTS / f".{target.name}.part"
+    shutil.rmtree(temporary, ignore_errors=True)
+    for name, data in files.items():
+        write("--publish", temporary / name, lambda path, data=data: path.write_bytes(data))
+    shutil.rmtree(target, ignore_errors=True)
+    os.replace(temporary, target)
+    return target
+
+
+def publish_demos(path, episodes=40):
+    """Puts the TCP paths of a demonstration file's first episodes at RESULTS/demos-TASK.npz, as `read_paths` reads them."""
+    file = read_npz(path, ("obs", "obs2", "length", "partition", "success", "meta"))
+    try:
+        task, length = json.loads(str(file["meta"]))["task"], file["length"][:episodes]
+        ends = np.cumsum(length)
+        P = [np.concatenate((file["obs"][end - n:end], file["obs2"][end - 1:end])) for n, end in zip(length, ends,
+                                                                                                  strict=True)]
+        cube = np.array([states[0, 22:25] if states.shape[1] == 25 else [np.nan] * 3 for states in P], np.float32)
+        arrays = {"tcp": np.concatenate([states[:, 16:19] - states[:, 19:22] for states in P]),  # P_e = P_g - e
+                  "goal": np.array([states[0, 16:19] for states in P]), "object": cube, "length": length,
+                  "partition": file["partition"][:episodes], "success": file["success"][:episodes]}
+        assert task in TASKS and len(arrays["tcp"]) == np.sum(length + 1)
+    except (AssertionError, IndexError, KeyError, TypeError, ValueError) as error:
+        fail(f"--publish {path}: not a demonstration file of pid_demo.py --record ({error})")
+    target = RESULTS / f"demos-{task}.npz"
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)
+    write("--publish", target, lambda path: path.write_bytes(out.getvalue()))
+    return target
+
+
+def index_row(run, config):
+    """A line of index.csv."""
+    row = {key: config.get(key, "") for key in INDEX_HEADER}
+    row |= {"name": run.path.name, "git_commit": config.get("versions", {}).get("git_commit", "")}
+    if run.column == PID:
+        row |= {"recipe": config["gains"], "finished": 1}
+    else:
+        progress = read_csv(run.path / "progress.csv", ("env_steps",), ("eval_success",))
+        measured = [value for value in progress["eval_success"] if value]
+        row |= {"env_steps": int(progress["env_steps"][-1:].sum()), "finished": int(not run.unfinished),
+                "eval_success": measured[-1] if measured else ""}
+    return row | {"P_scs_percent": f"{test_metrics(run.trials)['P_scs_percent']:g}" if run.trials else ""}
+
+
 def publish(sources):
     """Copies run folders (and demonstration files) into data/results and writes its index.csv. Returns remarks."""
-    raise NotImplementedError
+    published = [publish_demos(path) if path.suffix == ".npz" else publish_run(path) for path in sources]
+    configs = {path.parent: read_config(path) for path in sorted(RESULTS.glob("[!.]*/config.json"))}
+    rows = [index_row(read_run(folder, config), config) for folder, config in configs.items()]
+    best = {}  # of each task and recipe: the only one whose weights stay
+    for row in (row for row in rows if row["P_scs_percent"] and row["algo"] != "pid"):
+        first = best.setdefault((row["task"], row["recipe"]), row)
+        if float(row["P_scs_percent"]) > float(first["P_scs_percent"]):
+            best[row["task"], row["recipe"]] = row
+    kept = [RESULTS / row["name"] / "policy.pt" for row in best.values()]
+    for path in set(RESULTS.glob("*/policy.pt")) - set(kept):
+        path.unlink()
+    size = sum(path.stat().st_size for path in kept if path.exists())
+    out = io.StringIO()
+    writer = csv.DictWriter(out, INDEX_HEADER, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write("--publish", RESULTS / "index.csv", lambda path: path.write_text(out.getvalue(), encoding="utf-8"))
+    if size > 10e6:
+        fail(f"--publish: the policies in {RESULTS} take {size / 1e6:.1f} MB; at most 10 MB are allowed")
+    return [f"published {path}" for path in published] + [f"wrote {RESULTS / 'index.csv'}, {len(rows)} runs"]
 
 
 # ------------------------------------------------------------------------------------------ main
 
 def missing(task, runs):
-    """The commands that fill the gaps in a task's tables and figures, as lines."""
-    return []
+    """The commands that fill the gaps in a task's tables and figures, as lines to print."""
+    have, lines = {run.column for run in runs if run.returns.size}, []
+    gaps = {column["key"]: column for column in reversed(all_columns("training", task, runs))}  # a key's first column
+    words = [f"{column['sweep']}={key[2] if column['sweep'] == 'lambda' else key[1]:g}".replace("baseline=0", "baseline")
+             for key, column in reversed(gaps.items()) if key not in have]
+    if words:
+        recipe = next((group[1] for group in groups_of(runs) if group[0] != "pid"), "robust")
+        lines.append(f"python sweep.py --task {task} --recipe {recipe} --columns {' '.join(words)} --seeds 5 --jobs 2")
+    untested = [f"data/runs/{run.path.name}" for run in runs if run.column != PID and not run.unfinished
+                and not (run.trials and (run.path / "trajectories.npz").exists())]
+    lines += [f"python evaluate.py {name} --trials 500 --jobs 2" for name in untested]
+    gains = {run.group[1] for run in runs if run.column == PID and run.trials}
+    lines += [f"python evaluate.py --pid --task {task} --gains {name} --trials 500 --jobs 2"
+              for name in ("authors", "fast") if name not in gains]
+    if not (RESULTS / f"demos-{task}.npz").exists():
+        lines += [f"python pid_demo.py --task {task} --record 40 --gains fast --out data/demos-{task}.npz",
+                  f"python plot_curves.py --publish data/demos-{task}.npz"]
+    return ["", f"{TASKS[task]}: to fill the gaps", *("    " + line for line in lines)] if lines else []
 
 
 def draw_all(out, named):
     """Writes every table and figure into the folder `out`. Returns remarks."""
     remarks, gaps = [], []
     for task in TASKS:
-        runs, remarks_of_task = find_runs(task, None) if named is None else find_runs(task, named)
+        runs, remarks_of_task = find_runs(task, named)
         remarks += remarks_of_task
         gaps += missing(task, runs)
         for kind in METRICS:
@@ -853,7 +1002,7 @@ def main(argv=None):
         fail("--csv goes with --table, --out with --figure")
     if args.out and args.out.suffix not in (".png", ".pdf"):
         fail(f"--out {args.out}: a name that ends in .png or .pdf is expected")
-    if (args.table or args.figure not in (None, *OF_NO_TASK)) != bool(args.task):
+    if bool(args.task) != bool(args.table or args.figure and args.figure not in OF_NO_TASK):
         fail(f"--task: one of {', '.join(TASKS)} is expected with --table and with --figure of a task, not with others")
     if args.publish and args.runs:
         fail("--runs goes with --table, --figure and --all")
