@@ -611,7 +611,7 @@ def error_figure(task, runs):
 
 
 def draw_paths(figure, task, paths, title):
-    """TCP paths of read_paths from above and in 3-D in the tube of reachable positions, coloured by the goal's sector."""
+    """TCP paths of `read_paths` from above and in 3-D, in the tube of reachable positions; colour: the goal's sector."""
     first = -math.pi / 4 if task == "p2p" else 0.0  # the centre of S_1: its sector's start angle (sec:exp)
     borders = first + math.pi / 4 + math.pi / 2 * np.arange(4)
     circle = np.linspace(0, 2 * math.pi, 181)
@@ -626,8 +626,8 @@ def draw_paths(figure, task, paths, title):
         space.plot(x[[0, 1, 1, 0, 0]], y[[0, 1, 1, 0, 0]], [LOW, LOW, HIGH, HIGH, LOW], color="#555555", linewidth=0.6,
                    linestyle=(0, (4, 2)))
         middle = first + k * math.pi / 2
-        above.text(0.82 * math.cos(middle), 0.82 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center", va="center",
-                   color=COLOURS[k])
+        above.text(0.82 * math.cos(middle), 0.82 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center",
+                   va="center", color=COLOURS[k])
     for path in paths:
         k = round((math.atan2(path["goal"][1], path["goal"][0]) - first) / (math.pi / 2)) % 4
         for ax, n in ((above, 2), (space, 3)):
@@ -703,9 +703,10 @@ def partitions_figure(task=None, runs=None):
         left.plot([INNER * x, OUTER * x], [INNER * y, OUTER * y], color="#555555", linewidth=0.8, linestyle=(0, (4, 2)))
     for colour, label, routes in ((COLOURS[0], r"demonstrations $\tau^d$", [[k, k] for k in (0, 1, 2, 3) * 2]),
                                   (COLOURS[1], r"regular paths $\tau$", [range(3), range(2, 5)])):
+        left.plot([], [], color=colour, label=label)
         for sectors in routes:
             path = random_path(rng, sectors, 4)
-            left.plot(*path.T, color=colour, linewidth=1.2, label=label if sectors == routes[0] else None)
+            left.plot(*path.T, color=colour, linewidth=1.2)
             left.plot(*path[:-1:50].T, "o", color=colour, markersize=2.5)
             left.plot(*path[-1], "*", color=colour, markersize=6)
     left.set(aspect="equal", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5], xlabel="$x$ (m)", ylabel="$y$ (m)")
@@ -749,7 +750,7 @@ def workspace_figure(task=None, runs=None):
         clip = np.column_stack((points, np.ones(len(points)))) @ camera.T
         return (clip[:, :2] / clip[:, 3:] * (0.5, -0.5) + 0.5) * (width, height)
 
-    figure = Figure(figsize=(3.6, 3.0), layout="constrained")
+    figure = Figure(figsize=(3.6, 2.3), layout="constrained")
     ax = figure.add_subplot()
     arm = np.where(robot[..., None], image, 0)
     arm[..., 3] = 255 * robot
@@ -765,18 +766,13 @@ def workspace_figure(task=None, runs=None):
             ax.fill(x, y, color="#009E73", alpha=0.12, linewidth=0, zorder=3 if over else 1)
             for i in (0, 2):
                 ax.plot(x[i:i + 2], y[i:i + 2], color="#00664B", linewidth=0.8, zorder=3 if over else 1)
-    for name, radius in ((r"$\rho=0.3$ m", INNER), (r"$\rho=0.7$ m", OUTER)):
-        x, y = pixels(np.array([[radius * math.cos(to_camera + 0.9), radius * math.sin(to_camera + 0.9), HIGH]]))[0]
-        ax.text(x, y - 12, name, ha="center", va="bottom", fontsize=7, zorder=4)
-    for name, z in (("$z=0.25$ m", LOW), ("$z=0.65$ m", HIGH)):
-        x, y = pixels(np.array([[-OUTER * math.sin(to_camera), OUTER * math.cos(to_camera), z]]))[0]
-        ax.text(x + 15, y, name, va="center", fontsize=7, zorder=4)
     for n, joint in enumerate(ACTIVE_JOINTS, start=1):
         x, y = pixels(np.array([joints[joint]]))[0]
         ax.annotate(f"#{n}", (x, y), (x - 170, y - 40), va="center", ha="right", fontsize=7.5, zorder=5,
                     arrowprops={"arrowstyle": "-", "linewidth": 0.6})
-    ax.set(xlim=(80, width + 130), ylim=(height - 200, 150))
+    ax.set(xlim=(90, width - 90), ylim=(height - 220, 190))
     ax.axis("off")
+    ax.set_title(rf"${INNER}\leq\rho<{OUTER}$ m,  ${LOW}\leq z<{HIGH}$ m", y=-0.06, color="#00664B")
     return figure
 
 
@@ -807,9 +803,8 @@ def without_folders(value):
 def check_whole(run, config):
     """Exits with 2 and a line that names the run where it is of no clean commit or its files do not fit together."""
     commit = str(config.get("versions", {}).get("git_commit"))
-    if run.column != PID or "versions" in config:
-        if not re.fullmatch("[0-9a-f]{40}", commit):
-            fail(f"--publish {run.path}: made with git commit {commit!r}; a clean one of 40 hex digits is expected")
+    if run.column != PID and not re.fullmatch("[0-9a-f]{40}", commit):
+        fail(f"--publish {run.path}: made with git commit {commit!r}; a clean one of 40 hex digits is expected")
     if run.column != PID:
         episodes = read_csv(run.path / "episodes.csv", ("env_steps", "length"))
         progress = read_csv(run.path / "progress.csv", ("epoch", "env_steps"))
@@ -824,7 +819,7 @@ def check_whole(run, config):
         trials = read_npz(run.path / "trajectories.npz", ("length", "success"))
         read_errors(run.path / "trajectories.npz"), read_paths(run.path / "trajectories.npz")
         if not run.trials or any(not np.array_equal(trials[name], run.trials[name]) for name in trials):
-            fail(f"--publish {run.path}: trajectories.npz is not of the trials in evaluation.csv; run evaluate.py again")
+            fail(f"--publish {run.path}: trajectories.npz is not of evaluation.csv's trials; run evaluate.py again")
     elif run.column == PID and not run.trials:
         fail(f"--publish {run.path}: no evaluation.csv; run evaluate.py --pid first")
 
@@ -864,13 +859,13 @@ def publish_run(folder):
 
 
 def publish_demos(path, episodes=40):
-    """Puts the TCP paths of a demonstration file's first episodes at RESULTS/demos-TASK.npz, as `read_paths` reads them."""
+    """Puts the TCP paths of a demonstration file's first episodes at RESULTS/demos-TASK.npz, for `read_paths`."""
     file = read_npz(path, ("obs", "obs2", "length", "partition", "success", "meta"))
     try:
         task, length = json.loads(str(file["meta"]))["task"], file["length"][:episodes]
         ends = np.cumsum(length)
-        P = [np.concatenate((file["obs"][end - n:end], file["obs2"][end - 1:end])) for n, end in zip(length, ends,
-                                                                                                  strict=True)]
+        P = [np.concatenate((file["obs"][end - n:end], file["obs2"][end - 1:end]))
+             for n, end in zip(length, ends, strict=True)]
         cube = np.array([states[0, 22:25] if states.shape[1] == 25 else [np.nan] * 3 for states in P], np.float32)
         arrays = {"tcp": np.concatenate([states[:, 16:19] - states[:, 19:22] for states in P]),  # P_e = P_g - e
                   "goal": np.array([states[0, 16:19] for states in P]), "object": cube, "length": length,
@@ -929,8 +924,8 @@ def missing(task, runs):
     """The commands that fill the gaps in a task's tables and figures, as lines to print."""
     have, lines = {run.column for run in runs if run.returns.size}, []
     gaps = {column["key"]: column for column in reversed(all_columns("training", task, runs))}  # a key's first column
-    words = [f"{column['sweep']}={key[2] if column['sweep'] == 'lambda' else key[1]:g}".replace("baseline=0", "baseline")
-             for key, column in reversed(gaps.items()) if key not in have]
+    value = {"lambda": lambda key: f"={key[2]:g}", "demos": lambda key: f"={key[1]}", "baseline": lambda key: ""}
+    words = [column["sweep"] + value[column["sweep"]](key) for key, column in reversed(gaps.items()) if key not in have]
     if words:
         recipe = next((group[1] for group in groups_of(runs) if group[0] != "pid"), "robust")
         lines.append(f"python sweep.py --task {task} --recipe {recipe} --columns {' '.join(words)} --seeds 5 --jobs 2")
@@ -959,10 +954,10 @@ def draw_all(out, named):
                                  (".tex", table_latex(kind, task, rows))):
                 write("--all", out / f"table-{kind}-{task}{suffix}",
                       lambda path, text=text: path.write_text(text, encoding="utf-8"))
-        for name in DRAW.keys() - set(OF_NO_TASK):
-            save_figure("--all", name, task, runs, [out / f"{figure_name(name, task)}{kind}" for kind in (".pdf", ".png")])
+        for name in (name for name in DRAW if name not in OF_NO_TASK):
+            save_figure("--all", name, task, runs, [out / (figure_name(name, task) + end) for end in (".pdf", ".png")])
     for name in OF_NO_TASK:
-        save_figure("--all", name, None, [], [out / f"{figure_name(name, None)}{kind}" for kind in (".pdf", ".png")])
+        save_figure("--all", name, None, [], [out / (figure_name(name, None) + end) for end in (".pdf", ".png")])
     return [*remarks, f"wrote the tables and figures into {out}", *gaps]
 
 
@@ -1020,11 +1015,11 @@ def main(argv=None):
     else:
         runs, remarks = find_runs(args.task, args.runs) if args.task else ([], [])
         if args.figure == "learning" and not any(run.returns.size for run in runs):
-            fail(f"--figure: no run of task {args.task} with an episode; --runs FOLDER names some, {RUNS} is the default")
+            fail(f"--figure: no run of task {args.task} with an episode; --runs FOLDER names some")
         name = figure_name(args.figure, args.task)
         paths = [args.out] if args.out else [FIGURES / f"{name}{kind}" for kind in (".png", ".pdf")]
         save_figure("--out", args.figure, args.task, runs, paths)
-        remarks += [f"wrote {path}" for path in paths] + missing(args.task, runs) * bool(args.task)
+        remarks += [f"wrote {path}" for path in paths] + (missing(args.task, runs) if args.task else [])
     print("\n".join(remarks))
 
 
