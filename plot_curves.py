@@ -43,7 +43,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure  # without pyplot: a PNG is then always drawn by Agg, no display needed
 from matplotlib.lines import Line2D
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import bootstrap
 
 HERE = Path(__file__).resolve().parent
 PAPER, RESULTS, RUNS, FIGURES = HERE / "data/paper", HERE / "data/results", HERE / "data/runs", HERE / "figures"
@@ -331,8 +331,9 @@ def over_seeds(values, paper, digits, of_one=(math.nan, math.nan, "")):
 
 
 def iqm(values):
-    """Interquartile mean: the mean of the middle half."""
-    return trim_mean(values, 0.25)
+    """Interquartile mean: the mean of the middle half (scipy's trim_mean, which is too slow for a bootstrap)."""
+    cut = len(values) // 4
+    return np.sort(values)[cut:len(values) - cut].mean()
 
 
 def improvement(xs, ys):
@@ -428,7 +429,7 @@ def undecided(kind, rows):
             gap = ours[metric]["mean"] - theirs[metric]["mean"]
             lines.append(f"  {names[0]} and {names[1]}: the paper's {one[metric]:g} and {other[metric]:g}, our "
                          f"difference {gap:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}] ({group_label(group)})")
-    head = f"Pairs that the paper ranks by {metric} but that our seeds cannot tell apart (95 % interval contains 0):"
+    head = f"Pairs that the paper's {metric} ranks but our seeds cannot tell apart (95 % interval contains 0):"
     return [head, *(lines or ["  none"])] + [f"  not compared: {few} pairs with fewer than two seeds"] * bool(few)
 
 
@@ -576,8 +577,8 @@ def learning_figure(task, runs):
 
 def error_figure(task, runs):
     """Figures fig:p2p_errors, fig:p2po_errors, fig:pnp_errors: ||e_t|| over the successful test trials, a panel for
-    each of the paper's six columns. A trial that has ended keeps its last error, so that each counts alike at every t."""
-    runs = [run for run in runs if (run.path / "trajectories.npz").exists()]
+    each of the paper's six columns. A trial that has ended keeps its last error: each counts alike at every t."""
+    runs = [run for run in runs if run.column != PID and (run.path / "trajectories.npz").exists()]
     columns, groups = all_columns("test", task, runs), groups_of(runs)
     figure = Figure(figsize=(3.6, 4.8), layout="constrained")
     panels = figure.subplots(3, 2, sharex=True, sharey=True)
@@ -600,8 +601,9 @@ def error_figure(task, runs):
             ax.set_title(f"{column_label(column, None)} ({others[fixed]})")
             mark_gap(ax, drawn)
     panels[0, 0].set(xlim=(0, None), ylim=(0, None))
-    figure.supxlabel("$t$ (s)", fontsize=8)
-    figure.supylabel(r"$\Vert e_t\Vert$ (cm)", fontsize=8)
+    for ax in figure.axes:
+        ax.set(xlabel="$t$ (s)", ylabel=r"$\Vert e_t\Vert$ (cm)")
+        ax.label_outer()
     lines = [Line2D([], [], color=COLOURS[i % len(COLOURS)], label=group_label(g)) for i, g in enumerate(groups)]
     lines.append(Line2D([], [], color="k", linestyle=":", linewidth=0.8, label=r"$\epsilon=5$ cm"))
     figure.legend(handles=lines, loc="outside lower center", ncols=2, title=(
@@ -611,7 +613,7 @@ def error_figure(task, runs):
 
 
 def draw_paths(figure, task, paths, title):
-    """TCP paths of `read_paths` from above and in 3-D, in the tube of reachable positions; colour: the goal's sector."""
+    """TCP paths of `read_paths` from above and in 3-D, in the tube of reachable positions; the colour is the goal's."""
     first = -math.pi / 4 if task == "p2p" else 0.0  # the centre of S_1: its sector's start angle (sec:exp)
     borders = first + math.pi / 4 + math.pi / 2 * np.arange(4)
     circle = np.linspace(0, 2 * math.pi, 181)
@@ -626,7 +628,7 @@ def draw_paths(figure, task, paths, title):
         space.plot(x[[0, 1, 1, 0, 0]], y[[0, 1, 1, 0, 0]], [LOW, LOW, HIGH, HIGH, LOW], color="#555555", linewidth=0.6,
                    linestyle=(0, (4, 2)))
         middle = first + k * math.pi / 2
-        above.text(0.82 * math.cos(middle), 0.82 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center",
+        above.text(0.2 * math.cos(middle), 0.2 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center",
                    va="center", color=COLOURS[k])
     for path in paths:
         k = round((math.atan2(path["goal"][1], path["goal"][0]) - first) / (math.pi / 2)) % 4
@@ -639,7 +641,7 @@ def draw_paths(figure, task, paths, title):
     above.set(aspect="equal", xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5])
     space.set(xlabel="$x$ (m)", ylabel="$y$ (m)", zlabel="$z$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5],
               zticks=[0.2, 0.4, 0.6], xlim=(-OUTER, OUTER), ylim=(-OUTER, OUTER), zlim=(0.15, 0.75))
-    space.set_box_aspect((1.4, 1.4, 0.6), zoom=1.15)
+    space.set_box_aspect((1.4, 1.4, 0.6), zoom=1.0)
     space.view_init(elev=28, azim=-60)
     space.tick_params(pad=-2)
     for ax in (above, space):
@@ -671,22 +673,22 @@ def trajectories_figure(task, runs):
     return draw_paths(Figure(figsize=(5.4, 3.1), layout="constrained"), task, paths, title)
 
 
-def random_path(rng, sectors, K):
-    """A 2-D path as fig:partitions has it: a random way point (theta, rho) in each of these sectors out of K, linear in
-    between in cylinder coordinates. Returns (M, 2) points x, y in m; the way points are every 50th."""
-    theta = 2 * math.pi / K * (np.asarray(sectors) + rng.random(len(sectors)))
-    rho = rng.uniform(INNER, OUTER, len(sectors))
+def random_paths(rng, n, sectors, K):
+    """n 2-D paths as fig:partitions has them: a random way point (theta, rho) in each of these sectors out of K, linear
+    in between in cylinder coordinates. Returns (n, M, 2) points x, y in m; every 50th is a way point."""
     t = np.linspace(0, len(sectors) - 1, 50 * (len(sectors) - 1) + 1)
-    theta, rho = np.interp(t, np.arange(len(sectors)), theta), np.interp(t, np.arange(len(sectors)), rho)
+    weight = np.maximum(0, 1 - np.abs(t - np.arange(len(sectors))[:, None]))  # of each way point at each t
+    theta = 2 * math.pi / K * (np.asarray(sectors) + rng.random((n, len(sectors)))) @ weight
+    rho = rng.uniform(INNER, OUTER, (n, len(sectors))) @ weight
     return np.stack([rho * np.cos(theta), rho * np.sin(theta)], axis=-1)
 
 
-def path_lengths(K, paths=1000, seed=0):
-    """Lengths (paths,) in m of random demonstrations, from a point of a sector to another of the same, and of random
+def path_lengths(K, n=1000, seed=0):
+    """Lengths (n,) in m of random demonstrations, from a point of a sector to another of the same, and of random
     regular paths, from one sector to the furthest opposite one with a way point in each between. K = 1: the same."""
     rng = np.random.default_rng(seed)
-    demos, regular = (np.array([np.linalg.norm(np.diff(random_path(rng, sectors, K), axis=0), axis=1).sum()
-                                for _ in range(paths)]) for sectors in ([0, 0], range(K // 2 + 1)))
+    demos, regular = (np.linalg.norm(np.diff(random_paths(rng, n, sectors, K), axis=1), axis=2).sum(axis=1)
+                      for sectors in ([0, 0], range(K // 2 + 1)))
     return demos, demos if K == 1 else regular
 
 
@@ -705,7 +707,7 @@ def partitions_figure(task=None, runs=None):
                                   (COLOURS[1], r"regular paths $\tau$", [range(3), range(2, 5)])):
         left.plot([], [], color=colour, label=label)
         for sectors in routes:
-            path = random_path(rng, sectors, 4)
+            path, = random_paths(rng, 1, sectors, 4)
             left.plot(*path.T, color=colour, linewidth=1.2)
             left.plot(*path[:-1:50].T, "o", color=colour, markersize=2.5)
             left.plot(*path[-1], "*", color=colour, markersize=6)
@@ -770,9 +772,9 @@ def workspace_figure(task=None, runs=None):
         x, y = pixels(np.array([joints[joint]]))[0]
         ax.annotate(f"#{n}", (x, y), (x - 170, y - 40), va="center", ha="right", fontsize=7.5, zorder=5,
                     arrowprops={"arrowstyle": "-", "linewidth": 0.6})
-    ax.set(xlim=(90, width - 90), ylim=(height - 220, 190))
+    ax.set(xlim=(70, width - 70), ylim=(height - 200, 190))
     ax.axis("off")
-    ax.set_title(rf"${INNER}\leq\rho<{OUTER}$ m,  ${LOW}\leq z<{HIGH}$ m", y=-0.06, color="#00664B")
+    ax.set_title(rf"${INNER}\leq\rho<{OUTER}$ m,  ${LOW}\leq z<{HIGH}$ m", y=-0.02, color="#00664B")
     return figure
 
 
@@ -787,6 +789,7 @@ def save_figure(flag, name, task, runs, paths):
         for path in paths:
             stable = {"CreationDate": None} if path.suffix == ".pdf" else {}
             write(flag, path, lambda temporary, stable=stable: figure.savefig(temporary, dpi=300, metadata=stable))
+            figure.set_layout_engine("none")  # laid out once is enough
 
 
 # ------------------------------------------------------------------------------------------ publishing
