@@ -73,6 +73,7 @@ INDEX_HEADER = ["name", "task", "algo", "recipe", "symmetry", "variant", "num_de
                 "finished", "eval_success", "P_scs_percent", "git_commit"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe & Ito: safe for colour-blind eyes
 DASHES = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1.5, 1)))  # one a group, so that colour is free for the column
+GREEN, GREY, BORDER = COLOURS[2], "#555555", (0, (4, 2))  # the tube of reachable positions, the borders of sectors
 LOOK = {"font.family": "STIXGeneral", "mathtext.fontset": "stix", "font.size": 8, "legend.fontsize": 7,
         "legend.title_fontsize": 7, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
         "axes.titlesize": 8.5, "pdf.fonttype": 42}
@@ -127,25 +128,27 @@ def read_npz(path, names):
         fail(f"{path}: {error}; a whole .npz with the arrays {', '.join(names)} is expected")
 
 
+def split_trials(path, values, length):
+    """values (sum(length + 1), ...), of t = 0 ... length of one trial after another, as a list of a trial each."""
+    if length.dtype.kind not in "iu" or length.ndim != 1 or values.shape[:1] != (np.sum(length + 1),):
+        fail(f"{path}: its arrays do not fit together; length + 1 entries for each trial are expected")
+    return np.split(values, np.cumsum(length + 1)[:-1])
+
+
 def read_paths(path):
     """The TCP paths in a trajectories.npz or demos-TASK.npz: [{"tcp": (length + 1, 3), "goal", "object": (3,), m,
     "success"}]; object is NaN where there is none."""
     file = read_npz(path, PATHS)
-    length = file["length"][:len(file["goal"])]
-    if file["tcp"].shape != (np.sum(length + 1), 3) or not len(length) == len(file["goal"]) == len(file["object"]):
-        fail(f"{path}: its arrays do not fit together; tcp with length + 1 rows for each of goal's is expected")
-    parts = np.split(file["tcp"], np.cumsum(length + 1)[:-1])
-    return [{"tcp": tcp, "goal": goal, "object": cube, "success": bool(success)} for tcp, goal, cube, success
-            in zip(parts, file["goal"], file["object"], file["success"], strict=False)]
+    n = len(np.atleast_1d(file["goal"]))
+    file |= {"tcp": split_trials(path, file["tcp"], file["length"][:n])}
+    return [{name: file[name][i] for name in PATHS} for i in range(min(map(len, file.values())))]
 
 
 def read_errors(path):
     """||e_t|| in m (length + 1,) of each successful trial in a trajectories.npz."""
     file = read_npz(path, ("length", "success", "error"))
-    if file["error"].shape != (np.sum(file["length"] + 1),) or file["success"].shape != file["length"].shape:
-        fail(f"{path}: its arrays do not fit together; error with length + 1 entries a trial is expected")
-    parts = np.split(file["error"], np.cumsum(file["length"] + 1)[:-1])
-    return [error for error, success in zip(parts, file["success"], strict=True) if success]
+    errors = split_trials(path, file["error"], file["length"])
+    return [error for error, success in zip(errors, file["success"], strict=False) if success]
 
 
 def read_config(path):
@@ -536,7 +539,7 @@ def draw_panel(ax, sweep, columns, runs, groups):
     colours = iter(COLOURS * len(columns))
     for column in (column for column in columns if column["sweep"] in (sweep, "baseline", "other")):
         label = column_label(column, columns[0]["key"][0])
-        colour = "#555555" if column["sweep"] == "baseline" else next(colours)
+        colour = GREY if column["sweep"] == "baseline" else next(colours)
         mine = by_group(runs, column)
         for group, members in mine.items():
             draw_curve(ax, members, colour, DASHES[groups.index(group) % len(DASHES)], label)
@@ -546,9 +549,8 @@ def draw_panel(ax, sweep, columns, runs, groups):
 
 def mark_gap(ax, drawn):
     """Says in the middle of an empty panel that there are no runs for it."""
-    place = (0.5, 0.5, 0) if ax.name == "3d" else (0.5, 0.5)
-    (ax.text2D if ax.name == "3d" else ax.text)(*place[:2], "" if drawn else "no runs", ha="center", va="center",
-                                                color="#777777", transform=ax.transAxes)
+    draw_text = ax.text2D if ax.name == "3d" else ax.text
+    draw_text(0.5, 0.5, "" if drawn else "no runs", ha="center", va="center", color="#777777", transform=ax.transAxes)
 
 
 def learning_figure(task, runs):
@@ -619,14 +621,14 @@ def draw_paths(figure, task, paths, title):
     circle = np.linspace(0, 2 * math.pi, 181)
     above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
     for radius in (INNER, OUTER):
-        above.plot(radius * np.cos(circle), radius * np.sin(circle), color="#009E73", linewidth=0.8)
+        above.plot(radius * np.cos(circle), radius * np.sin(circle), color=GREEN, linewidth=0.8)
         for z in (LOW, HIGH):
-            space.plot(radius * np.cos(circle), radius * np.sin(circle), z, color="#009E73", linewidth=0.6, alpha=0.8)
+            space.plot(radius * np.cos(circle), radius * np.sin(circle), z, color=GREEN, linewidth=0.6, alpha=0.8)
     for k, border in enumerate(borders):
         x, y = np.array([INNER, OUTER]) * math.cos(border), np.array([INNER, OUTER]) * math.sin(border)
-        above.plot(x, y, color="#555555", linewidth=0.8, linestyle=(0, (4, 2)))
-        space.plot(x[[0, 1, 1, 0, 0]], y[[0, 1, 1, 0, 0]], [LOW, LOW, HIGH, HIGH, LOW], color="#555555", linewidth=0.6,
-                   linestyle=(0, (4, 2)))
+        above.plot(x, y, color=GREY, linewidth=0.8, linestyle=BORDER)
+        space.plot(x[[0, 1, 1, 0, 0]], y[[0, 1, 1, 0, 0]], [LOW, LOW, HIGH, HIGH, LOW], color=GREY, linewidth=0.6,
+                   linestyle=BORDER)
         middle = first + k * math.pi / 2
         above.text(0.2 * math.cos(middle), 0.2 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center",
                    va="center", color=COLOURS[k])
@@ -639,7 +641,8 @@ def draw_paths(figure, task, paths, title):
                     markeredgewidth=0.3)
             ax.plot(*path["object"][:n, None], "s", color="#888888", markersize=3, zorder=1)  # NaN: nothing
     above.set(aspect="equal", xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5])
-    space.set(xlabel="$x$ (m)", ylabel="$y$ (m)", zlabel="$z$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5],
+    space.text2D(0.98, 0.8, "$z$ (m)", ha="right", transform=space.transAxes)  # zlabel would be cut off
+    space.set(xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5],
               zticks=[0.2, 0.4, 0.6], xlim=(-OUTER, OUTER), ylim=(-OUTER, OUTER), zlim=(0.15, 0.75))
     space.set_box_aspect((1.4, 1.4, 0.6), zoom=1.0)
     space.view_init(elev=28, azim=-60)
@@ -651,8 +654,8 @@ def draw_paths(figure, task, paths, title):
     marks += [("s", "#888888", "obstacle" if task == "p2po" else "cube")] * (task != "p2p")
     lines = [Line2D([], [], linestyle="", marker=marker, color=colour, markeredgecolor="k", markeredgewidth=0.4,
                     markersize=5, label=label) for marker, colour, label in marks]
-    lines += [Line2D([], [], color="#009E73", linewidth=0.8, label=r"reachable $\rho$, $z$"),
-              Line2D([], [], color="#555555", linewidth=0.8, linestyle=(0, (4, 2)), label=r"border of $\mathcal{S}_k$")]
+    lines += [Line2D([], [], color=GREEN, linewidth=0.8, label=r"reachable $\rho$, $z$"),
+              Line2D([], [], color=GREY, linewidth=0.8, linestyle=BORDER, label=r"border of $\mathcal{S}_k$")]
     figure.legend(handles=lines, loc="outside lower center", ncols=len(lines))
     return figure
 
@@ -699,10 +702,10 @@ def partitions_figure(task=None, runs=None):
     rng = np.random.default_rng(3)
     circle = np.linspace(0, 2 * math.pi, 181)
     for radius in (INNER, OUTER):
-        left.plot(radius * np.cos(circle), radius * np.sin(circle), color="#009E73", linewidth=0.8)
+        left.plot(radius * np.cos(circle), radius * np.sin(circle), color=GREEN, linewidth=0.8)
     for k in range(4):
         x, y = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
-        left.plot([INNER * x, OUTER * x], [INNER * y, OUTER * y], color="#555555", linewidth=0.8, linestyle=(0, (4, 2)))
+        left.plot([INNER * x, OUTER * x], [INNER * y, OUTER * y], color=GREY, linewidth=0.8, linestyle=BORDER)
     for colour, label, routes in ((COLOURS[0], r"demonstrations $\tau^d$", [[k, k] for k in (0, 1, 2, 3) * 2]),
                                   (COLOURS[1], r"regular paths $\tau$", [range(3), range(2, 5)])):
         left.plot([], [], color=colour, label=label)
@@ -765,14 +768,14 @@ def workspace_figure(task=None, runs=None):
             corners = [(radius * math.cos(angle), radius * math.sin(angle), z)
                        for angle, z in ((a, LOW), (b, LOW), (b, HIGH), (a, HIGH))]
             x, y = pixels(np.array(corners)).T
-            ax.fill(x, y, color="#009E73", alpha=0.12, linewidth=0, zorder=3 if over else 1)
+            ax.fill(x, y, color=GREEN, alpha=0.12, linewidth=0, zorder=3 if over else 1)
             for i in (0, 2):
                 ax.plot(x[i:i + 2], y[i:i + 2], color="#00664B", linewidth=0.8, zorder=3 if over else 1)
     for n, joint in enumerate(ACTIVE_JOINTS, start=1):
         x, y = pixels(np.array([joints[joint]]))[0]
         ax.annotate(f"#{n}", (x, y), (x - 170, y - 40), va="center", ha="right", fontsize=7.5, zorder=5,
                     arrowprops={"arrowstyle": "-", "linewidth": 0.6})
-    ax.set(xlim=(70, width - 70), ylim=(height - 200, 190))
+    ax.set(xlim=(70, width - 70), ylim=(height - 160, 190))
     ax.axis("off")
     ax.set_title(rf"${INNER}\leq\rho<{OUTER}$ m,  ${LOW}\leq z<{HIGH}$ m", y=-0.02, color="#00664B")
     return figure
