@@ -156,12 +156,14 @@ def read_config(path):
         config = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         fail(f"{path}: {error}; a run's flags as JSON are expected")
-    if isinstance(config, dict) and config.get("algo") == "pid":  # as evaluate.py --pid leaves it
+    if not isinstance(config, dict) or not isinstance(config.get("versions", {}), dict):
+        fail(f"{path}: no key 'task', or 'versions' is no object; a run's flags as JSON are expected")
+    if config.get("algo") == "pid":  # as evaluate.py --pid leaves it
         if config.get("task") not in TASKS or not isinstance(config.get("gains"), str):
             fail(f"{path}: 'task' and 'gains' of the PID are expected, a task of {', '.join(TASKS)}")
         return config | {"quick": False}
     for key, kind in CONFIG.items():
-        if not isinstance(config, dict) or key not in config:
+        if key not in config:
             fail(f"{path}: no key {key!r}; {', '.join(CONFIG)} are expected")
         value, number = config[key], kind not in (str, bool)
         if not isinstance(value, kind) or (number and (isinstance(value, bool) or not 0 <= value < 1e12)):
@@ -197,18 +199,19 @@ def read_run(folder, config):
                returns=episodes["return"], trials=read_trials(folder))
 
 
-def find_runs(task, named):
-    """The runs of a task below the named folders (None: data/results, data/runs), and remarks to print."""
+def find_runs(task, named, mixed=False):
+    """The runs of a task below the named folders (None: data/results, data/runs), and remarks to print; mixed: those of
+    other tasks may be named too, and of this one none."""
     configs, remarks = {}, []
     for folder in map(Path, named or [RESULTS, RUNS]):
         found = {path.parent: read_config(path) for path in sorted(folder.resolve().rglob("config.json"))}
         if named and not found:
             fail(f"--runs {folder}: no run there; a folder that holds config.json, or holds such folders, is expected")
-        if named and folder.resolve() in found and found[folder.resolve()]["task"] != task:
+        if not mixed and named and folder.resolve() in found and found[folder.resolve()]["task"] != task:
             fail(f"--runs {folder}: a run of task {found[folder.resolve()]['task']}; only --task {task} is allowed")
         configs |= found  # by real path, so that a folder named twice counts once
     mine = {path: config for path, config in configs.items() if config["task"] == task}
-    if named and not mine:
+    if named and not mine and not mixed:
         fail(f"--runs: no run of task {task} among the {len(configs)} found; --task may be {', '.join(TASKS)}")
     if quick := 0 if named else sum(config["quick"] for config in mine.values()):
         mine = {path: config for path, config in mine.items() if not config["quick"]}
@@ -857,7 +860,7 @@ def publish_run(folder):
     target = RESULTS / folder.resolve().name
     temporary = RESULTS / f".{target.name}.part"
     shutil.rmtree(temporary, ignore_errors=True)
-    for name, data in files.items():
+    for name, data in reversed(files.items()):  # config.json last: without it, half a copy is no run
         write("--publish", temporary / name, lambda path, data=data: path.write_bytes(data))
     shutil.rmtree(target, ignore_errors=True)
     os.replace(temporary, target)
@@ -869,15 +872,15 @@ def publish_demos(path, episodes=40):
     file = read_npz(path, ("obs", "obs2", "length", "partition", "success", "meta"))
     try:
         task, length = json.loads(str(file["meta"]))["task"], file["length"][:episodes]
-        ends = np.cumsum(length)
-        P = [np.concatenate((file["obs"][end - n:end], file["obs2"][end - 1:end]))
-             for n, end in zip(length, ends, strict=True)]
-        cube = np.array([states[0, 22:25] if states.shape[1] == 25 else [np.nan] * 3 for states in P], np.float32)
-        arrays = {"tcp": np.concatenate([states[:, 16:19] - states[:, 19:22] for states in P]),  # P_e = P_g - e
-                  "goal": np.array([states[0, 16:19] for states in P]), "object": cube, "length": length,
+        states = [np.concatenate((file["obs"][end - n:end], file["obs2"][end - 1:end]))
+                  for n, end in zip(length, np.cumsum(length), strict=True)]
+        cube = np.array([s[0, 22:25] if s.shape[1] == 25 else [np.nan] * 3 for s in states], np.float32)
+        arrays = {"tcp": np.concatenate([s[:, 16:19] - s[:, 19:22] for s in states]),  # P_e = P_g - e
+                  "goal": np.array([s[0, 16:19] for s in states]), "object": cube, "length": length,
                   "partition": file["partition"][:episodes], "success": file["success"][:episodes]}
-        assert task in TASKS and len(arrays["tcp"]) == np.sum(length + 1)
-    except (AssertionError, IndexError, KeyError, TypeError, ValueError) as error:
+        if task not in TASKS or len(arrays["tcp"]) != np.sum(length + 1):
+            raise ValueError("its arrays do not fit together")
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         fail(f"--publish {path}: not a demonstration file of pid_demo.py --record ({error})")
     target = RESULTS / f"demos-{task}.npz"
     out = io.BytesIO()
@@ -905,15 +908,13 @@ def publish(sources):
     published = [publish_demos(path) if path.suffix == ".npz" else publish_run(path) for path in sources]
     configs = {path.parent: read_config(path) for path in sorted(RESULTS.glob("[!.]*/config.json"))}
     rows = [index_row(read_run(folder, config), config) for folder, config in configs.items()]
-    best = {}  # of each task and recipe: the only one whose weights stay
-    for row in (row for row in rows if row["P_scs_percent"] and row["algo"] != "pid"):
-        first = best.setdefault((row["task"], row["recipe"]), row)
-        if float(row["P_scs_percent"]) > float(first["P_scs_percent"]):
-            best[row["task"], row["recipe"]] = row
-    kept = [RESULTS / row["name"] / "policy.pt" for row in best.values()]
+    best = {}  # the run of each task and recipe that keeps its weights
+    for row in (row for row in rows if (RESULTS / row["name"] / "policy.pt").exists()):
+        best.setdefault((row["task"], row["recipe"]), []).append((-float(row["P_scs_percent"] or -1), row["name"]))
+    kept = [RESULTS / min(names)[1] / "policy.pt" for names in best.values()]
     for path in set(RESULTS.glob("*/policy.pt")) - set(kept):
         path.unlink()
-    size = sum(path.stat().st_size for path in kept if path.exists())
+    size = sum(path.stat().st_size for path in kept)
     out = io.StringIO()
     writer = csv.DictWriter(out, INDEX_HEADER, lineterminator="\n")
     writer.writeheader()
@@ -951,7 +952,7 @@ def draw_all(out, named):
     """Writes every table and figure into the folder `out`. Returns remarks."""
     remarks, gaps = [], []
     for task in TASKS:
-        runs, remarks_of_task = find_runs(task, named)
+        runs, remarks_of_task = find_runs(task, named, mixed=True)
         remarks += remarks_of_task
         gaps += missing(task, runs)
         for kind in METRICS:

@@ -457,6 +457,7 @@ def test_all_writes_every_table_and_figure_and_says_how_to_fill_the_gaps(tmp_pat
     assert "--task pnp --recipe robust --columns lambda=5 lambda=10 demos=150 demos=250 baseline --seeds 5" in said
     assert "evaluate.py data/runs/a --trials 500" in said and "evaluate.py --pid --task p2p --gains authors" in said
     assert "pid_demo.py --task p2po --record 40" in said
+    plot_curves.main(["--all", str(tmp_path / "out"), "--runs", str(tmp_path / "runs/a")])  # of one task: no error
 
 
 # ------------------------------------------------------------------------------------------ publishing
@@ -495,6 +496,20 @@ def test_only_the_best_run_of_a_task_and_recipe_keeps_its_policy_and_an_unfinish
         plot_curves.main(["--publish", str(run)])
     assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
     assert [row["finished"] for row in csv.DictReader((tmp_path / "results/index.csv").open())] == ["1", "1", "0"]
+
+
+def test_a_better_run_that_was_published_without_weights_leaves_them_to_the_next(tmp_path, capsys):
+    write_run(tmp_path / "results/old", success=(1, 1), seed=1)
+    run = write_publishable(tmp_path / "runs/a", success=(1, 0))
+    plot_curves.main(["--publish", str(run)])
+    assert (tmp_path / "results/a/policy.pt").exists()
+
+
+def test_a_run_takes_the_place_of_an_older_one_of_the_same_name(tmp_path, capsys):
+    old = write_run(tmp_path / "results/a", [5.0] * 9, compress=True)
+    (old / "agent.gif").write_text("old")
+    plot_curves.main(["--publish", str(write_publishable(tmp_path / "runs/a"))])
+    assert not (old / "agent.gif").exists() and cell(table(capsys, old)[1], "R90")["mean"] == "1.0"
 
 
 def test_what_is_published_reads_like_the_run_it_came_from(tmp_path, capsys):
