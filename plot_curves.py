@@ -36,7 +36,7 @@ import zipfile
 import zlib
 from collections import Counter
 from dataclasses import dataclass
-from itertools import combinations, groupby
+from itertools import combinations, groupby, product
 from pathlib import Path
 
 import matplotlib
@@ -123,7 +123,10 @@ def read_npz(path, names):
     """{name: array} of an .npz file, without pickled objects."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in names}
+            arrays = {name: file[name] for name in names}
+        if odd := [name for name in names if arrays[name].dtype.kind not in "biuf" and name != "meta"]:
+            raise ValueError(f"array {odd[0]} holds no numbers")
+        return arrays
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         fail(f"{path}: {error}; a whole .npz with the arrays {', '.join(names)} is expected")
 
@@ -139,8 +142,9 @@ def read_paths(path):
     """The TCP paths in a trajectories.npz or demos-TASK.npz: [{"tcp": (length + 1, 3), "goal", "object": (3,), m,
     "success"}]; object is NaN where there is none."""
     file = read_npz(path, PATHS)
-    n = len(np.atleast_1d(file["goal"]))
-    file |= {"tcp": split_trials(path, file["tcp"], file["length"][:n])}
+    if odd := [name for name in ("tcp", "goal", "object") if file[name].ndim != 2 or file[name].shape[1] != 3]:
+        fail(f"{path}: array {odd[0]} is {file[odd[0]].shape}; (n, 3) is expected")
+    file["tcp"] = split_trials(path, file["tcp"], np.atleast_1d(file["length"])[:len(file["goal"])])
     return [{name: file[name][i] for name in PATHS} for i in range(min(map(len, file.values())))]
 
 
@@ -617,24 +621,31 @@ def error_figure(task, runs):
     return figure
 
 
+def draw_ring(ax, borders):
+    """The workspace from above: the tube of reachable rho and the sectors' borders (their angles, rad)."""
+    circle = np.linspace(0, 2 * math.pi, 181)
+    for rho in (INNER, OUTER):
+        ax.plot(rho * np.cos(circle), rho * np.sin(circle), color=GREEN, linewidth=0.8)
+    for theta in borders:
+        ax.plot([INNER * math.cos(theta), OUTER * math.cos(theta)], [INNER * math.sin(theta), OUTER * math.sin(theta)],
+                color=GREY, linewidth=0.8, linestyle=BORDER)
+    ax.set(aspect="equal", xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5])
+
+
 def draw_paths(figure, task, paths, title):
     """TCP paths of `read_paths` from above and in 3-D, in the tube of reachable positions; the colour is the goal's."""
     first = -math.pi / 4 if task == "p2p" else 0.0  # the centre of S_1: its sector's start angle (sec:exp)
     borders = first + math.pi / 4 + math.pi / 2 * np.arange(4)
-    circle = np.linspace(0, 2 * math.pi, 181)
+    circle, corners = np.linspace(0, 2 * math.pi, 181), np.array([INNER, OUTER, OUTER, INNER, INNER])
     above, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")
-    for radius in (INNER, OUTER):
-        above.plot(radius * np.cos(circle), radius * np.sin(circle), color=GREEN, linewidth=0.8)
-        for z in (LOW, HIGH):
-            space.plot(radius * np.cos(circle), radius * np.sin(circle), z, color=GREEN, linewidth=0.6, alpha=0.8)
-    for k, border in enumerate(borders):
-        x, y = np.array([INNER, OUTER]) * math.cos(border), np.array([INNER, OUTER]) * math.sin(border)
-        above.plot(x, y, color=GREY, linewidth=0.8, linestyle=BORDER)
-        space.plot(x[[0, 1, 1, 0, 0]], y[[0, 1, 1, 0, 0]], [LOW, LOW, HIGH, HIGH, LOW], color=GREY, linewidth=0.6,
-                   linestyle=BORDER)
-        middle = first + k * math.pi / 2
-        above.text(0.2 * math.cos(middle), 0.2 * math.sin(middle), rf"$\mathcal{{S}}_{k + 1}$", ha="center",
-                   va="center", color=COLOURS[k])
+    draw_ring(above, borders)
+    for rho, z in product((INNER, OUTER), (LOW, HIGH)):
+        space.plot(rho * np.cos(circle), rho * np.sin(circle), z, color=GREEN, linewidth=0.6, alpha=0.8)
+    for k, theta in enumerate(borders):
+        space.plot(corners * math.cos(theta), corners * math.sin(theta), [LOW, LOW, HIGH, HIGH, LOW], color=GREY,
+                   linewidth=0.6, linestyle=BORDER)
+        above.text(0.2 * math.cos(theta - math.pi / 4), 0.2 * math.sin(theta - math.pi / 4),
+                   rf"$\mathcal{{S}}_{k + 1}$", ha="center", va="center", color=COLOURS[k])
     for path in paths:
         k = round((math.atan2(path["goal"][1], path["goal"][0]) - first) / (math.pi / 2)) % 4
         for ax, n in ((above, 2), (space, 3)):
@@ -643,7 +654,6 @@ def draw_paths(figure, task, paths, title):
             ax.plot(*path["goal"][:n, None], "*", color=COLOURS[k], markersize=6, markeredgecolor="k",
                     markeredgewidth=0.3)
             ax.plot(*path["object"][:n, None], "s", color="#888888", markersize=3, zorder=1)  # NaN: nothing
-    above.set(aspect="equal", xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5])
     space.text2D(0.98, 0.8, "$z$ (m)", ha="right", transform=space.transAxes)  # zlabel would be cut off
     space.set(xlabel="$x$ (m)", ylabel="$y$ (m)", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5],
               zticks=[0.2, 0.4, 0.6], xlim=(-OUTER, OUTER), ylim=(-OUTER, OUTER), zlim=(0.15, 0.75))
@@ -703,12 +713,7 @@ def partitions_figure(task=None, runs=None):
     figure = Figure(figsize=(5.4, 2.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     rng = np.random.default_rng(3)
-    circle = np.linspace(0, 2 * math.pi, 181)
-    for radius in (INNER, OUTER):
-        left.plot(radius * np.cos(circle), radius * np.sin(circle), color=GREEN, linewidth=0.8)
-    for k in range(4):
-        x, y = math.cos(k * math.pi / 2), math.sin(k * math.pi / 2)
-        left.plot([INNER * x, OUTER * x], [INNER * y, OUTER * y], color=GREY, linewidth=0.8, linestyle=BORDER)
+    draw_ring(left, math.pi / 2 * np.arange(4))
     for colour, label, routes in ((COLOURS[0], r"demonstrations $\tau^d$", [[k, k] for k in (0, 1, 2, 3) * 2]),
                                   (COLOURS[1], r"regular paths $\tau$", [range(3), range(2, 5)])):
         left.plot([], [], color=colour, label=label)
@@ -717,7 +722,6 @@ def partitions_figure(task=None, runs=None):
             left.plot(*path.T, color=colour, linewidth=1.2)
             left.plot(*path[:-1:50].T, "o", color=colour, markersize=2.5)
             left.plot(*path[-1], "*", color=colour, markersize=6)
-    left.set(aspect="equal", xticks=[-0.5, 0, 0.5], yticks=[-0.5, 0, 0.5], xlabel="$x$ (m)", ylabel="$y$ (m)")
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2, columnspacing=0.8, handlelength=1.4)
     K, lengths = np.arange(1, 13), [path_lengths(K) for K in range(1, 13)]
     for colour, marker, label, curves in (
@@ -794,7 +798,7 @@ def save_figure(flag, name, task, runs, paths):
         figure = DRAW[name](task, runs)
         for path in paths:
             stable = {"CreationDate": None} if path.suffix == ".pdf" else {}
-            write(flag, path, lambda temporary, stable=stable: figure.savefig(temporary, dpi=300, metadata=stable))
+            write(flag, path, lambda temporary, stable=stable: figure.savefig(temporary, dpi=200, metadata=stable))
             figure.set_layout_engine("none")  # laid out once is enough
 
 

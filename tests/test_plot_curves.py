@@ -545,6 +545,10 @@ def pickled(path):
     np.savez(path, length=np.array([{}], dtype=object), success=np.array([True]), error=np.zeros(1))
 
 
+def respoil(path, **arrays):
+    np.savez(path, **(dict(np.load(path)) | arrays))
+
+
 @pytest.mark.parametrize("spoil, says", [
     (lambda run: (run / "config.json").write_text(json.dumps(CONFIG)), "git commit 'None'"),
     (lambda run: (run / "config.json").write_text(json.dumps(
@@ -557,6 +561,9 @@ def pickled(path):
     (lambda run: (run / "progress.csv").write_text("epoch,env_steps,eval_success\n2,4000,\n"), "do not fit together"),
     (lambda run: (run / "trajectories.npz").write_bytes((run / "trajectories.npz").read_bytes()[:300]), "trajectories"),
     (lambda run: pickled(run / "trajectories.npz"), "allow_pickle=False"),
+    (lambda run: respoil(run / "trajectories.npz", error=np.zeros(3)), "do not fit together"),
+    (lambda run: respoil(run / "trajectories.npz", goal=np.zeros(2)), "(n, 3) is expected"),
+    (lambda run: respoil(run / "trajectories.npz", success=np.array(["yes", "no"])), "holds no numbers"),
     (lambda run: (run / "evaluation.csv").write_text("trial,success\n0,1\n"), "no column length"),
     (lambda run: (run / "evaluation.csv").unlink(), "trajectories.npz is not of"),
 ])
