@@ -4,12 +4,14 @@ import gzip
 import io
 import json
 import math
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import plot_curves
 from plot_curves import interval, over_seeds, training_metrics
@@ -25,24 +27,34 @@ def folders(tmp_path, monkeypatch):
         monkeypatch.setattr(plot_curves, name, tmp_path / name.lower())
 
 
-def write_run(folder, returns=(1.0,) * 60, steps=4000, compress=False, **config):
-    """A run folder like a training script's; `steps`: environment steps after the last epoch in progress.csv."""
+def write_run(folder, returns=(1.0,) * 60, steps=4000, compress=False, success=None, **config):
+    """A run folder like a training script's; `steps`: environment steps after the last epoch in progress.csv;
+    success: that of each trial in evaluation.csv and trajectories.npz, if any. Trial i takes 3 + i steps and has the
+    return 10 + i; its error falls from 50 cm to 5 cm in equal steps."""
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(CONFIG | config))
     rows = "".join(f"{i},{20 * i},{value},20,0,\n" for i, value in enumerate(returns, start=1))
     tables = {"episodes.csv": "episode,env_steps,return,length,success,collision\n" + rows,
-              "progress.csv": f"epoch,env_steps,EpRet\n1,{steps // 2},\n2,{steps},\n"}
+              "progress.csv": f"epoch,env_steps,EpRet,eval_success\n1,{steps // 2},,0.5\n2,{steps},,\n"}
+    if success is not None:
+        rows = "".join(f"{i},{won},,0,{3 + i},{10 + i},{20 + i},5,6\n" for i, won in enumerate(success))
+        tables["evaluation.csv"] = ("trial,success,failure,grasped,length,return,effort_percent,final_error_cm,e95_cm\n"
+                                    + rows)
+        n = np.arange(len(success)) + 3
+        np.savez(folder / "trajectories.npz", length=n, success=np.array(success, bool), goal=np.full((len(n), 3), 0.4),
+                 error=np.concatenate([np.linspace(0.5, 0.05, k + 1) for k in n]).astype(np.float32),
+                 tcp=np.full((np.sum(n + 1), 3), 0.5, np.float32), object=np.full((len(n), 3), np.nan))
     for name, text in tables.items():
         path = folder / (name + ".gz" * compress)
         path.write_bytes(gzip.compress(text.encode()) if compress else text.encode())
     return folder
 
 
-def table(capsys, *runs, task="p2p"):
-    """(text, rows of the CSV) of the training table of these run folders; of the default ones if none is named."""
+def table(capsys, *runs, task="p2p", kind="training"):
+    """(text, rows of the CSV) of a table of these run folders; of the default ones if none is named."""
     out = plot_curves.FIGURES.parent / "table.csv"
     named = ["--runs", *map(str, runs)] if runs else []
-    plot_curves.main(["--table", "training", "--task", task, "--csv", str(out), *named])
+    plot_curves.main(["--table", kind, "--task", task, "--csv", str(out), *named])
     return capsys.readouterr().out, list(csv.DictReader(io.StringIO(out.read_text())))
 
 
@@ -178,6 +190,107 @@ def test_runs_that_differ_in_recipe_symmetry_variant_or_length_are_never_average
     assert sorted(row["mean"] for row in rows if row["metric"] == "R90" and row["mean"]) == ["1.0", "3.0"]
 
 
+# ------------------------------------------------------------------------------------------ test table
+
+def test_the_test_table_averages_success_over_trials_and_the_rest_over_the_successful_ones(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", success=(1, 0, 1, 0))
+    text, rows = table(capsys, kind="test")
+    assert [float(cell(rows, metric)["mean"]) for metric in ("P_scs_percent", "T_eff", "R_test", "E_95_cm")] == [
+        50, 21, 11, 6]
+    one = cell(rows, "P_scs_percent")
+    assert [one[k] for k in ("interval", "paper", "seeds", "paper_outside")] == ["Wilson over trials", "99.6", "1", "1"]
+    assert "50.0 [15.0, 85.0] *" in text
+
+
+def test_without_a_successful_trial_only_the_success_rate_is_known(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", success=(0, 0))
+    _, rows = table(capsys, kind="test")
+    assert (cell(rows, "P_scs_percent")["mean"], cell(rows, "T_eff")["mean"]) == ("0.0", "")
+
+
+def test_several_seeds_have_a_bootstrap_interval_over_seeds(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", success=(1, 1))
+    write_run(tmp_path / "runs/b", success=(1, 0), seed=1)
+    _, rows = table(capsys, kind="test")
+    P = cell(rows, "P_scs_percent")
+    assert [P[k] for k in ("mean", "low", "high", "interval", "seeds")] == ["75.0", "50.0", "100.0", "BCa", "2"]
+
+
+@pytest.mark.parametrize("successes, trials, low, high", [(0, 10, 0, 27.75), (10, 10, 72.25, 100),
+                                                          (250, 500, 45.63, 54.37)])
+def test_wilsons_interval_is_that_of_the_textbook(successes, trials, low, high):
+    assert plot_curves.wilson(successes, trials) == pytest.approx((low, high), abs=0.01)
+
+
+def test_the_lambda_sweep_of_p2po_is_matched_by_sweep_and_value(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", task="p2po", num_demos=250, lambda_bc=1, success=(1, 1))
+    write_run(tmp_path / "runs/b", task="p2po", num_demos=100, lambda_bc=1, success=(0, 0))
+    _, rows = table(capsys, task="p2po", kind="test")
+    sweep, demos = cell(rows, "P_scs_percent", "lambda", "250", 1), cell(rows, "P_scs_percent", "demos", "100", 1)
+    assert (sweep["paper"], sweep["mean"], demos["paper"], demos["mean"]) == ("96.2", "100.0", "71.6", "0.0")
+
+
+def test_published_evaluations_of_the_PID_stand_beside_the_papers_a_row_each(tmp_path, capsys):
+    for gains, won in (("authors", 0), ("fast", 1)):
+        write_run(tmp_path / f"results/pid-p2p-{gains}", success=(1, won))
+        (tmp_path / f"results/pid-p2p-{gains}/config.json").write_text(
+            json.dumps({"task": "p2p", "algo": "pid", "gains": gains}))
+    text, rows = table(capsys, kind="test")
+    pid = [(row["recipe"], row["mean"], row["paper"]) for row in rows
+           if row["sweep"] == "pid" and row["metric"] == "P_scs_percent"]
+    assert pid == [("authors", "50.0", "59.0"), ("fast", "100.0", "59.0")]
+    assert "pid" not in table(capsys)[0]  # it has no training
+
+
+def test_latex_has_the_papers_symbols_and_escapes_the_rest(tmp_path):
+    write_run(tmp_path / "runs/a", success=(1, 1))
+    rows = plot_curves.table_rows("test", "p2p", plot_curves.find_runs("p2p", None)[0])
+    latex = plot_curves.table_latex("test", "p2p", rows)
+    body = latex[latex.index("\\toprule"):]
+    assert r"$P_{\mathrm{scs}}$ (\%)" in body and "lambda_BC" not in body and "so2 4k steps & 100.0 [" in body
+    assert r"$^*$" in body and len({line.count("&") for line in body.splitlines() if "&" in line}) == 1
+
+
+# ------------------------------------------------------------------------------------------ across seeds
+
+def test_pairs_that_the_paper_ranks_are_listed_where_the_difference_may_be_0(tmp_path, capsys):
+    for i, (lam, low, high) in enumerate([(0.1, 0, 4), (0.6, 1, 5), (1.8, 8, 9)]):
+        write_run(tmp_path / f"runs/{i}-0", [low] * 60, lambda_bc=lam, seed=0)
+        write_run(tmp_path / f"runs/{i}-1", [high] * 60, lambda_bc=lam, seed=1)
+    write_run(tmp_path / "runs/one", [0.0] * 60, num_demos=0, lambda_bc=0)
+    text, _ = table(capsys)
+    listed = [line for line in text.splitlines() if "our difference" in line]
+    assert len(listed) == 1 and "lambda_BC=0.1 and N_demos=100 lambda_BC=0.6: the paper's 3.72 and 6.83" in listed[0]
+    assert "our difference -1.00 [-5.00, 3.00]" in listed[0]
+    assert "not compared: 3 pairs with fewer than two seeds" in text
+
+
+def test_the_interquartile_mean_is_that_of_the_middle_half():
+    assert plot_curves.iqm(np.array([-100, 1, 2, 3, 4, 5, 6, 900.0])) == 3.5
+
+
+def test_the_probability_of_improvement_counts_ties_half_and_averages_over_columns():
+    x, y = [np.array([1.0, 2.0]), np.array([5.0])], [np.array([1.0, 0.0]), np.array([9.0, 7.0])]
+    assert plot_curves.improvement(x, y) == (3.5 / 4 + 0) / 2
+
+
+def test_the_stratified_bootstrap_draws_each_columns_seeds_among_themselves():
+    strata = [np.array([1.0, 1.0]), np.array([5.0, 5.0])]  # columns differ, seeds do not
+    assert plot_curves.stratified(lambda s: np.concatenate(s).mean(), strata) == (3, 3, 3)
+    value, low, high = plot_curves.stratified(lambda s: np.concatenate(s).mean(), [np.array([0.0, 1.0])])
+    assert (value, low, high) == (0.5, 0, 1)
+
+
+def test_groups_are_compared_below_the_training_table_where_they_have_two_seeds(tmp_path, capsys):
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/a{seed}", [8.0 + seed] * 60, seed=seed, success=(1, 1))
+        write_run(tmp_path / f"runs/b{seed}", [2.0 + seed] * 60, seed=seed, recipe="paper", success=(1, 0))
+    text, _ = table(capsys)
+    assert "ddpg paper so2 4k steps: R90 mean 2.50, IQM 2.50 [2.00, 3.00], 2 runs in 1 column(s)" in text
+    assert "P(ddpg paper so2 4k steps > ddpg robust so2 4k steps) in R90: 0.00 [0.00, 0.00]" in text
+    assert "ddpg robust so2 4k steps: P_scs_percent mean 100.0" in text
+
+
 # ------------------------------------------------------------------------------------------ which runs
 
 def test_quick_runs_are_left_out_unless_they_are_named(tmp_path, capsys):
@@ -231,7 +344,7 @@ def test_two_runs_of_one_configuration_and_seed_clash(tmp_path, capsys, one, oth
     assert str(tmp_path / one) in err and str(tmp_path / other) in err
 
 
-# ------------------------------------------------------------------------------------------ figure
+# ------------------------------------------------------------------------------------------ figures
 
 def test_the_figure_draws_each_sweep_with_the_baseline_and_the_papers_R90(tmp_path):
     for i, (N, lam) in enumerate([(100, 0.1), (80, 1), (0, 0), (300, 7)]):
@@ -284,15 +397,194 @@ def test_the_figure_is_written_as_png_and_pdf_or_to_the_named_file(tmp_path, cap
     assert (tmp_path / "new/x.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_an_error_curve_is_over_the_successful_trials_and_each_counts_alike_at_every_t(tmp_path):
+    write_run(tmp_path / "runs/a", success=(1, 0, 1))  # 3 and 5 steps from 50 to 5 cm
+    axes = plot_curves.error_figure("p2p", plot_curves.find_runs("p2p", None)[0]).axes
+    assert len(axes) == 6 and [text.get_text() for ax in axes for text in ax.texts].count("no runs") == 5
+    t, mean = axes[4].lines[0].get_data()
+    assert axes[4].get_title() == r"$\lambda_{BC}=1.8$ ($N_{demos}=100$)"
+    assert t == pytest.approx([0, 0.02, 0.04, 0.06, 0.08, 0.1])
+    assert mean == pytest.approx([50, (35 + 41) / 2, (20 + 32) / 2, (5 + 23) / 2, (5 + 14) / 2, 5])
+    assert [ax.lines[-1].get_ydata()[0] for ax in axes] == [5] * 6  # epsilon
+
+
+def test_trajectories_are_the_successful_ones_of_the_best_run_with_start_and_goal(tmp_path):
+    write_run(tmp_path / "runs/a", success=(1, 0, 1))
+    write_run(tmp_path / "runs/b", success=(0, 0, 1), seed=1)
+    runs = plot_curves.find_runs("p2p", None)[0]
+    figure = plot_curves.trajectories_figure("p2p", runs)
+    for ax in figure.axes:
+        assert [line.get_marker() for line in ax.lines].count("*") == 2
+    assert "seed 0" in figure.get_suptitle()
+    figure = plot_curves.trajectories_figure("p2p", [])
+    assert [ax.texts[-1].get_text() for ax in figure.axes] == ["no runs", "no runs"]
+
+
+def test_a_random_path_has_a_way_point_in_each_sector_and_is_linear_in_cylinder_coordinates():
+    x, y = plot_curves.random_paths(np.random.default_rng(0), 1, range(3), 8)[0].T
+    theta, rho = np.arctan2(y, x), np.hypot(x, y)
+    assert (theta[::50] // (math.pi / 4)).tolist() == [0, 1, 2] and rho.min() >= 0.3 and rho.max() < 0.7
+    for values in (theta, rho):
+        assert np.diff(values[:51]) == pytest.approx((values[50] - values[0]) / 50)
+
+
+def test_path_lengths_are_the_same_each_time_and_shrink_with_K():
+    demos, regular = plot_curves.path_lengths(1, n=20)
+    assert np.array_equal(demos, regular) and np.array_equal(demos, plot_curves.path_lengths(1, n=20)[0])
+    means = [[lengths.mean() for lengths in plot_curves.path_lengths(K, n=100)] for K in (2, 4, 12)]
+    assert means[0][0] > means[1][0] > means[2][0] and all(demo < path for demo, path in means)
+
+
+def test_the_workspace_picture_shows_the_arm_and_labels_its_four_active_joints():
+    ax, = plot_curves.workspace_figure().axes
+    assert [text.get_text() for text in ax.texts] == ["#1", "#2", "#3", "#4"]
+    arm = ax.images[0].get_array()[..., 3] > 0
+    assert 0.01 < arm.mean() < 0.3
+
+
+def test_all_writes_every_table_and_figure_and_says_how_to_fill_the_gaps(tmp_path, monkeypatch, capsys):
+    empty = dict.fromkeys(plot_curves.DRAW, lambda task, runs: plot_curves.Figure((1, 1)))
+    monkeypatch.setattr(plot_curves, "DRAW", empty)
+    write_run(tmp_path / "runs/a", task="pnp", algo="ppo", num_demos=400, lambda_bc=15)
+    plot_curves.main(["--all", str(tmp_path / "out")])
+    tasks = ("p2p", "p2po", "pnp")
+    names = {f"table-{kind}-{task}.{end}" for kind in ("training", "test") for task in tasks
+             for end in ("txt", "csv", "tex")}
+    figures = [f"{name}-{task}" for name in ("learning", "error", "demos", "trajectories") for task in tasks]
+    names |= {f"fig-{name}.{end}" for name in (*figures, "partitions", "workspace") for end in ("pdf", "png")}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    said = capsys.readouterr().out
+    assert "--task pnp --recipe robust --columns lambda=5 lambda=10 demos=150 demos=250 baseline --seeds 5" in said
+    assert "evaluate.py data/runs/a --trials 500" in said and "evaluate.py --pid --task p2p --gains authors" in said
+    assert "pid_demo.py --task p2po --record 40" in said
+    plot_curves.main(["--all", str(tmp_path / "out"), "--runs", str(tmp_path / "runs/a")])  # of one task: no error
+
+
+# ------------------------------------------------------------------------------------------ publishing
+
+COMMIT = {"versions": {"git_commit": "0123456789" * 4}, "max_ep_len": 400, "data_dir": "/home/me/runs"}
+
+
+def write_publishable(folder, **config):
+    run = write_run(folder, [1.0] * 200, **(COMMIT | {"success": (1, 0)} | config))
+    torch.save({"weights": {"0.weight": torch.zeros(2)}}, run / "policy.pt")
+    return run
+
+
+def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_time(tmp_path, capsys):
+    run = write_publishable(tmp_path / "runs/a", command=["/home/me/ddpg_demoease.py", "--demos=/home/me/d.npz"])
+    contents = []
+    for _ in range(2):
+        plot_curves.main(["--publish", str(run)])
+        contents.append({path.name: path.read_bytes() for path in (tmp_path / "results/a").iterdir()})
+    assert contents[0] == contents[1] and sorted(contents[0]) == [
+        "config.json", "episodes.csv.gz", "evaluation.csv.gz", "policy.pt", "progress.csv.gz", "trajectories.npz"]
+    config = json.loads(contents[0]["config.json"])
+    assert "/home" not in str(config) and config["data_dir"] == "data/runs"
+    assert config["command"] == ["ddpg_demoease.py", "--demos=d.npz"]
+    assert gzip.decompress(contents[0]["episodes.csv.gz"]) == (run / "episodes.csv").read_bytes()
+    row, = csv.DictReader((tmp_path / "results/index.csv").open())
+    assert [row[k] for k in ("name", "num_demos", "env_steps", "finished", "eval_success", "P_scs_percent")] == [
+        "a", "100", "4000", "1", "0.5", "50"]
+    assert row["git_commit"] == COMMIT["versions"]["git_commit"]
+
+
+def test_only_the_best_run_of_a_task_and_recipe_keeps_its_policy_and_an_unfinished_one_is_said_so(tmp_path, capsys):
+    runs = [write_publishable(tmp_path / f"runs/{i}", seed=i, success=won) for i, won in enumerate([(1, 0), (1, 1)])]
+    runs.append(write_publishable(tmp_path / "runs/2", recipe="paper", success=(0, 0), epochs=3))
+    for run in runs:
+        plot_curves.main(["--publish", str(run)])
+    assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
+    assert [row["finished"] for row in csv.DictReader((tmp_path / "results/index.csv").open())] == ["1", "1", "0"]
+
+
+def test_a_better_run_that_was_published_without_weights_leaves_them_to_the_next(tmp_path, capsys):
+    write_run(tmp_path / "results/old", success=(1, 1), seed=1)
+    run = write_publishable(tmp_path / "runs/a", success=(1, 0))
+    plot_curves.main(["--publish", str(run)])
+    assert (tmp_path / "results/a/policy.pt").exists()
+
+
+def test_a_run_takes_the_place_of_an_older_one_of_the_same_name(tmp_path, capsys):
+    old = write_run(tmp_path / "results/a", [5.0] * 9, compress=True)
+    (old / "agent.gif").write_text("old")
+    plot_curves.main(["--publish", str(write_publishable(tmp_path / "runs/a"))])
+    assert not (old / "agent.gif").exists() and cell(table(capsys, old)[1], "R90")["mean"] == "1.0"
+
+
+def test_what_is_published_reads_like_the_run_it_came_from(tmp_path, capsys):
+    run = write_publishable(tmp_path / "x/a")
+    plot_curves.main(["--publish", str(run)])
+    capsys.readouterr()
+    for kind in ("training", "test"):
+        assert table(capsys, run, kind=kind) == table(capsys, tmp_path / "results/a", kind=kind)
+
+
+def test_a_published_PID_evaluation_needs_no_commit(tmp_path, capsys):
+    run = write_run(tmp_path / "results/pid-p2p-fast", success=(1, 1))
+    (run / "config.json").write_text(json.dumps({"task": "p2p", "algo": "pid", "gains": "fast"}))
+    plot_curves.main(["--publish", str(run)])
+    assert not (run / "evaluation.csv").exists() and (run / "evaluation.csv.gz").exists()
+    assert json.loads((run / "config.json").read_text()) == {"task": "p2p", "algo": "pid", "gains": "fast"}
+
+
+def test_a_demonstration_file_is_published_as_TCP_paths(tmp_path, capsys):
+    P_e = np.arange(15, dtype=np.float32).reshape(5, 3)  # two episodes, of 2 and 1 steps
+    s = np.zeros((5, 22), np.float32)
+    s[:, 16:19], s[:, 19:22] = 1, 1 - P_e
+    np.savez(tmp_path / "d.npz", obs=s[[0, 1, 3]], obs2=s[[1, 2, 4]], length=np.array([2, 1]),
+             partition=np.array([3, 0]), success=np.array([True, False]), meta=np.array(json.dumps({"task": "p2p"})))
+    plot_curves.main(["--publish", str(tmp_path / "d.npz")])
+    paths = plot_curves.read_paths(tmp_path / "results/demos-p2p.npz")
+    assert [path["tcp"].tolist() for path in paths] == [P_e[:3].tolist(), P_e[3:].tolist()]
+    assert [path["success"] for path in paths] == [True, False] and np.isnan(paths[0]["object"]).all()
+    assert [line.get_marker() for line in plot_curves.demos_figure("p2p", []).axes[0].lines].count("*") == 1
+
+
+def pickled(path):
+    np.savez(path, length=np.array([{}], dtype=object), success=np.array([True]), error=np.zeros(1))
+
+
+def respoil(path, **arrays):
+    np.savez(path, **(dict(np.load(path)) | arrays))
+
+
+@pytest.mark.parametrize("spoil, says", [
+    (lambda run: (run / "config.json").write_text(json.dumps(CONFIG)), "git commit 'None'"),
+    (lambda run: (run / "config.json").write_text(json.dumps(
+        CONFIG | {"versions": {"git_commit": COMMIT["versions"]["git_commit"] + "-dirty"}})), "-dirty'"),
+    (lambda run: (run / "episodes.csv").unlink(), "episodes.csv"),
+    (lambda run: (run / "policy.pt").unlink(), "no policy.pt"),
+    (lambda run: (run / "policy.pt").write_bytes(pickle.dumps(Path)), "policy.pt"),
+    (lambda run: (run / "policy.pt").write_bytes((run / "policy.pt").read_bytes()[:500]), "policy.pt"),
+    (lambda run: (run / "progress.csv").write_text("epoch,env_steps,eval_success\n1,90000,\n"), "do not fit together"),
+    (lambda run: (run / "progress.csv").write_text("epoch,env_steps,eval_success\n2,4000,\n"), "do not fit together"),
+    (lambda run: (run / "trajectories.npz").write_bytes((run / "trajectories.npz").read_bytes()[:300]), "trajectories"),
+    (lambda run: pickled(run / "trajectories.npz"), "allow_pickle=False"),
+    (lambda run: respoil(run / "trajectories.npz", error=np.zeros(3)), "do not fit together"),
+    (lambda run: respoil(run / "trajectories.npz", goal=np.zeros(2)), "(n, 3) is expected"),
+    (lambda run: respoil(run / "trajectories.npz", success=np.array(["yes", "no"])), "holds no numbers"),
+    (lambda run: (run / "evaluation.csv").write_text("trial,success\n0,1\n"), "no column length"),
+    (lambda run: (run / "evaluation.csv").unlink(), "trajectories.npz is not of"),
+])
+def test_a_run_that_is_not_whole_or_of_no_clean_commit_is_not_published(tmp_path, capsys, spoil, says):
+    run = write_publishable(tmp_path / "runs/a")
+    spoil(run)
+    err = error_line(capsys, "--publish", run)
+    assert str(run) in err and says in err and not (tmp_path / "results/a").exists()
+
+
 # ------------------------------------------------------------------------------------------ bad input
 
 TABLE = ("--table", "training", "--task", "p2p")
 
 
 @pytest.mark.parametrize("argv, names", [
-    ((), "--task"), (("--task", "p2p"), "--table --figure"), (("--table", "training"), "--task"),
+    ((), "--table --figure"), (("--task", "p2p"), "--table --figure"), (("--table", "training"), "--task"),
     (("--table", "training", "--task", "walk"), "'p2p', 'p2po', 'pnp'"),
-    (("--table", "test", "--task", "p2p"), "--table"),
+    (("--table", "tests", "--task", "p2p"), "--table"), (("--figure", "error"), "--task"),
+    (("--all", "x", "--task", "p2p"), "--task"), (("--figure", "workspace", "--task", "p2p"), "--task"),
+    (("--publish", "x", "--runs", "x"), "--runs"), (("--all", "x", "--csv", "x.csv"), "--csv"),
     ((*TABLE, "--figure", "learning"), "--figure"), ((*TABLE, "--out", "x.png"), "--out"),
     ((*TABLE, "--sed", "1"), "--sed"), (("--tab", "training", "--task", "p2p"), "--table"),
     (("--figure", "learning", "--task", "p2p", "--csv", "x.csv"), "--csv"),
@@ -302,6 +594,21 @@ TABLE = ("--table", "training", "--task", "p2p")
 ])
 def test_a_bad_flag_is_one_line_that_names_it(capsys, argv, names):
     assert names in error_line(capsys, *argv)
+
+
+def test_a_run_of_another_task_that_is_itself_named_is_an_error(tmp_path, capsys):
+    runs = write_run(tmp_path / "a"), write_run(tmp_path / "b", task="pnp")
+    assert f"--runs {runs[1]}: a run of task pnp" in error_line(capsys, *TABLE, "--runs", *runs)
+
+
+@pytest.mark.parametrize("text, says", [("trial,success\n0,1\n", "no column length"),
+                                        (None, "success 0 or 1"), ("", "no column trial")])
+def test_a_garbled_evaluation_is_one_line(tmp_path, capsys, text, says):
+    run = write_run(tmp_path / "runs/a", success=(1, 1))
+    path = run / "evaluation.csv"
+    path.write_text(path.read_text().replace("1,1,,", "1,2,,") if text is None else text)
+    err = error_line(capsys, "--table", "test", "--task", "p2p")
+    assert f"{path}: " in err and says in err
 
 
 def test_runs_named_of_another_task_only_are_an_error_but_among_others_are_passed_over(tmp_path, capsys):
