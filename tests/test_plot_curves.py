@@ -335,6 +335,15 @@ def test_a_published_copy_of_a_run_is_no_second_seed(tmp_path, capsys):
     assert cell(rows, "R90")["seeds"] == "1"
 
 
+def test_of_a_run_that_went_on_after_its_beginning_was_published_the_longer_one_counts(tmp_path, capsys):
+    write_run(tmp_path / "runs/a", [1.0] * 60)
+    write_run(tmp_path / "results/a", [1.0] * 40)
+    _, rows = table(capsys)
+    assert cell(rows, "R90")["seeds"] == "1"
+    (run,), _ = plot_curves.find_runs("p2p", None)
+    assert run.returns.size == 60
+
+
 @pytest.mark.parametrize("one, other, returns", [("runs/a", "runs/b", 1.0), ("results/a", "runs/b", 1.0),
                                                  ("results/a", "runs/a", 2.0), ("x/a", "y/a", 1.0)])
 def test_two_runs_of_one_configuration_and_seed_clash(tmp_path, capsys, one, other, returns):
