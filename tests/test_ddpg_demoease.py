@@ -481,7 +481,7 @@ class Scripted:
     """What train() needs of an environment; all follows from the seed and the actions. Remembers every step."""
 
     observation_space = gymnasium.spaces.Box(-9, 9, (22,), np.float32)
-    goal = (0.3, 0.4, 0.5)
+    goal, tcp = (0.3, 0.4, 0.5), (0.0, 0.0, 0.5)
 
     def __init__(self):
         self.np_random, self.unwrapped, self.steps, self.at_step = np.random.default_rng(), self, [], None

@@ -493,7 +493,8 @@ def test_a_run_folder_holds_the_files_of_the_design_and_no_others(unbroken, agen
     config = json.loads((folder / "config.json").read_text())
     width = 22 if config["task"] == "p2p" else 25
     assert policy["task"] == config["task"] and policy["symmetry"] == config["symmetry"]
-    assert policy["sizes"] == [width, 16, 16, 4] and policy["output"] == ("tanh" if agent in DDPG else "linear")
+    assert policy["sizes"] == [width + (agent == "ppo robust"), 16, 16, 4]  # one more says whether the cube is grasped
+    assert policy["output"] == ("tanh" if agent in DDPG else "linear")
     assert not {"name", "time", "seed"} & set(policy)
 
 
