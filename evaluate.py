@@ -171,13 +171,13 @@ def intervals(rows):
     """95 % intervals (low, high) of `metrics`: Wilson's for P_scs, Student's for means over the successful trials."""
     from scipy import stats  # a second, which a training run need not spend
 
-    n = sum(row["success"] for row in rows)
+    n, m = sum(row["success"] for row in rows), metrics(rows)
     low, high = stats.binomtest(n, len(rows)).proportion_ci(method="wilson")
     found = {"P_scs_percent": (100 * low, 100 * high)}
     for name, column in OF_SUCCESSFUL.items():
         x = np.array([row[column] for row in rows if row["success"]])
         half = stats.t.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n) if n > 1 else math.nan
-        found[name] = (metrics(rows)[name] - half, metrics(rows)[name] + half)
+        found[name] = (m[name] - half, m[name] + half)
     return found
 
 

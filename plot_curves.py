@@ -43,7 +43,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure  # without pyplot: a PNG is then always drawn by Agg, no display needed
 from matplotlib.lines import Line2D
-from scipy.stats import bootstrap
+from scipy.stats import binomtest, bootstrap
 
 HERE = Path(__file__).resolve().parent
 PAPER, RESULTS, RUNS, FIGURES = HERE / "data/paper", HERE / "data/results", HERE / "data/runs", HERE / "figures"
@@ -53,6 +53,7 @@ LABELS = {"training": {"p2p": "tab:p2p", "p2po": "tab:p2p-o", "pnp": "tab:pnp"},
           "test": {"p2p": "tab:p2p_imp", "p2po": "tab:p2po_imp", "pnp": "tab:pnp_imp"}}
 METRICS = {"training": {"R10": 2, "R90": 2, "I_R": 2, "T50": 0},  # and the decimals that the paper prints
            "test": {"P_scs_percent": 1, "T_eff": 1, "R_test": 2, "E_95_cm": 2}}
+OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm"}  # means over successful trials
 RANKED = {"training": "R90", "test": "P_scs_percent"}  # the metric by which columns are compared
 SYMBOLS = {"R10": r"$\overline{R}_{10}$", "R90": r"$\overline{R}_{90}$", "I_R": "$I_R$", "T50": "$T_{50}$",
            "P_scs_percent": r"$P_{\mathrm{scs}}$ (\%)", "T_eff": r"$\overline{T}_{\mathrm{eff}}$",
@@ -292,9 +293,8 @@ def training_metrics(returns):
 def test_metrics(trials):
     """The metrics of one seed (`Test Study`) from its evaluation.csv; NaN where no trial succeeded."""
     won = trials["success"] == 1
-    columns = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm"}
-    return {"P_scs_percent": 100 * won.mean(),
-            **{metric: trials[column][won].mean() if won.any() else math.nan for metric, column in columns.items()}}
+    return {"P_scs_percent": 100 * won.mean(), **{metric: trials[column][won].mean() if won.any() else math.nan
+                                                  for metric, column in OF_SUCCESSFUL.items()}}
 
 
 def interval(*samples, statistic=np.mean):
@@ -312,20 +312,13 @@ def difference(a, b, axis=-1):
     return np.mean(a, axis=axis) - np.mean(b, axis=axis)
 
 
-def wilson(successes, trials):
-    """Wilson's 95 % interval of a success rate, in percent."""
-    z2, p = 1.959964**2, successes / trials
-    half = math.sqrt(z2 * (p * (1 - p) / trials + z2 / (4 * trials**2)))
-    return tuple(100 * (p + z2 / (2 * trials) + sign * half) / (1 + z2 / trials) for sign in (-1, 1))
-
-
 def over_trials(trials, metric):
     """95 % interval of a single seed's test metric: low, high, method."""
     won = trials["success"] == 1
     if metric == "P_scs_percent":
-        return *wilson(won.sum(), len(won)), "Wilson over trials"
-    column = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm"}[metric]
-    low, high, method = interval(trials[column][won])
+        low, high = binomtest(int(won.sum()), len(won)).proportion_ci(method="wilson")
+        return 100 * low, 100 * high, "Wilson over trials"
+    low, high, method = interval(trials[OF_SUCCESSFUL[metric]][won])
     return low, high, method + " over trials" * bool(method)
 
 
@@ -945,8 +938,8 @@ def missing(task, runs):
                 and not (run.trials and (run.path / "trajectories.npz").exists())]
     lines += [f"python evaluate.py {name} --trials 500 --jobs 2" for name in untested]
     gains = {run.group[1] for run in runs if run.column == PID and run.trials}
-    lines += [f"python evaluate.py --pid --task {task} --gains {name} --trials 500 --jobs 2"
-              for name in ("authors", "fast") if name not in gains]
+    lines += [f"python evaluate.py --pid --task {task} --gains {name} --trials 500 --jobs 2 "
+              f"--out data/runs/pid-{task}-{name}" for name in ("authors", "fast") if name not in gains]
     if not (RESULTS / f"demos-{task}.npz").exists():
         lines += [f"python pid_demo.py --task {task} --record 40 --gains fast --out data/demos-{task}.npz",
                   f"python plot_curves.py --publish data/demos-{task}.npz"]

@@ -57,7 +57,8 @@ class Run:
 
     def steps(self):
         """Environment steps done, by progress.csv; of these a part may have to be done again."""
-        return int(self.rows()[-1]["env_steps"]) if self.rows() else 0
+        rows = self.rows()
+        return int(rows[-1]["env_steps"]) if rows else 0
 
     def rows(self):
         try:
@@ -220,7 +221,8 @@ def run_here(runs, jobs):
                 places.append(place)
                 bar.close()
                 ended(run, STOPPED if asked and process.returncode < 0 else process.returncode)
-                tqdm.write(" ".join([f"{run.state()[0]:8}", str(run.folder), run.state()[1]]).rstrip())
+                state, error = run.state()
+                tqdm.write(f"{state:8} {run.folder} {error}".rstrip())
         time.sleep(0.2)
     return bool(asked)
 

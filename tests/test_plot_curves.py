@@ -219,7 +219,8 @@ def test_several_seeds_have_a_bootstrap_interval_over_seeds(tmp_path, capsys):
 @pytest.mark.parametrize("successes, trials, low, high", [(0, 10, 0, 27.75), (10, 10, 72.25, 100),
                                                           (250, 500, 45.63, 54.37)])
 def test_wilsons_interval_is_that_of_the_textbook(successes, trials, low, high):
-    assert plot_curves.wilson(successes, trials) == pytest.approx((low, high), abs=0.01)
+    outcome = {"success": np.arange(trials) < successes}
+    assert plot_curves.over_trials(outcome, "P_scs_percent")[:2] == pytest.approx((low, high), abs=0.01)
 
 
 def test_the_lambda_sweep_of_p2po_is_matched_by_sweep_and_value(tmp_path, capsys):
@@ -465,6 +466,7 @@ def test_all_writes_every_table_and_figure_and_says_how_to_fill_the_gaps(tmp_pat
     said = capsys.readouterr().out
     assert "--task pnp --recipe robust --columns lambda=5 lambda=10 demos=150 demos=250 baseline --seeds 5" in said
     assert "evaluate.py data/runs/a --trials 500" in said and "evaluate.py --pid --task p2p --gains authors" in said
+    assert "--out data/runs/pid-p2p-authors" in said  # without it the trials are only printed
     assert "pid_demo.py --task p2po --record 40" in said
     plot_curves.main(["--all", str(tmp_path / "out"), "--runs", str(tmp_path / "runs/a")])  # of one task: no error
 
