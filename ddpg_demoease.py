@@ -72,6 +72,10 @@ class Flags:
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128 on p2p, 256 1024 256 on p2po, 512 512 256 on pnp",
                                                 low=1)  # fmt: skip
     # the parts of the robust recipe (ours)
+    demo_noise: float | None = flag(None, "standard deviation of noise on the actions that demonstrations are recorded "
+                                    "with (pid_demo.record); 0, robust: 0.2", low=0)  # fmt: skip
+    conservative: float | None = flag(None, "weight in L_C of loss_conservative; 0, robust: 0.5", low=0)
+    updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=0)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
@@ -95,10 +99,10 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes, 250 epo
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  lr_decay=False, polyak=0.995),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   lr_decay=True, polyak=0.98),
+    "paper": dict(symmetry="gas", gains="authors", demo_noise=0.0, conservative=0.0, updates_per_step=1.0,
+                  critic_layernorm=False, clip_target=False, normalize_q=False, lr_decay=False, polyak=0.995),
+    "robust": dict(symmetry="canonical", gains="fast", demo_noise=0.2, conservative=0.5, updates_per_step=0.25,
+                   critic_layernorm=True, clip_target=True, normalize_q=True, lr_decay=True, polyak=0.98),
 }  # fmt: skip
 QUICK = dict(recipe="robust", epochs=15, lr_decay=False)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
@@ -273,6 +277,12 @@ def loss_C(Q_s_a, y):
     return ((Q_s_a - y) ** 2).mean()
 
 
+def loss_conservative(Q_demo, Q_own):
+    """Where the critic holds the policy's action better than the demonstrated one, by how much (ours, after Kumar et
+    al., CQL, 2020): without it Q is largest at actions that nobody has tried, and the mask is 0 from the start."""
+    return (Q_own - Q_demo).clamp(min=0).mean()
+
+
 def loss_O(Q_s_pi, normalize_q):
     """ag:d-ease-off; normalize_q (ours) keeps its scale, so that lambda_BC means the same throughout training."""
     mean_Q = Q_s_pi.mean()
@@ -311,12 +321,12 @@ class Learner:
         self.return_range = (-4.0, TASKS[flags.task].return_max)
 
     def block(self, B_o, B_d, left=1.0):
-        """`update_every` updates (B_d None: no cloning). Returns the last one's measurements, floats by name.
+        """The updates of one block (B_d None: no cloning). Returns the last one's measurements, floats by name.
 
         left: the fraction of the run that is still to come, for lr_decay.
         """
         f = self.flags
-        n = f.update_every
+        n = max(1, round(f.updates_per_step * f.update_every))
         if f.lr_decay:
             for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
                 group["lr"] = lr * min(1.0, 2 * left)
@@ -348,14 +358,21 @@ class Learner:
                 y = y.clamp(*self.return_range)
         u = self.net.pre_tanh(torch.cat((s, s_demo)))
         a_pi, a_hat = torch.tanh(u).split((n, n_demo))
-        # One pass of the critic for L_C (which reaches its weights), L_O (which reaches the actor) and the mask.
-        Q = self.net.Q(torch.cat((s, s, s_demo, s_demo)), torch.cat((a, a_pi, a_hat.detach(), a_demo)), n, 2 * n)
-        Q_s_a, Q_s_pi, Q_own, Q_demo = Q.split((n, n, n_demo, n_demo))
-        L_C = loss_C(Q_s_a, y)
-        L_O = L_A = loss_O(Q_s_pi, f.normalize_q)
+        # One pass of the critic: first the rows that reach its weights (L_C), then those that reach the actor (L_O),
+        # then those of the mask alone.
+        rows_Q = {"s_a": (s, a), "s_pi": (s, a_pi), "own": (s_demo, a_hat.detach()), "demo": (s_demo, a_demo)}
+        train = n
+        if f.conservative:
+            rows_Q["s_pi"], train = rows_Q.pop("s_pi"), n + 2 * n_demo
+        Q = self.net.Q(*(torch.cat(x) for x in zip(*rows_Q.values(), strict=True)), train, train + n)
+        Q = dict(zip(rows_Q, Q.split([len(x) for x, _ in rows_Q.values()]), strict=True))
+        L_C = loss_C(Q["s_a"], y)
+        if f.conservative and n_demo:
+            L_C = L_C + f.conservative * loss_conservative(Q["demo"], Q["own"])
+        L_O = L_A = loss_O(Q["s_pi"], f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
-            M = mask(Q_demo, Q_own)
+            M = mask(Q["demo"], Q["own"])
             L_BC = loss_BC(a_demo, a_hat, M)
             L_A = loss_A(L_O, L_BC, f.lambda_bc)
 
@@ -371,8 +388,8 @@ class Learner:
                 "L_C": L_C.detach(),
                 "L_A": L_A.detach(),
                 "mask_fraction": M.mean(),
-                "Q_mean": Q_s_a.mean(),
-                "Q_max": Q_s_a.max(),
+                "Q_mean": Q["s_a"].mean(),
+                "Q_max": Q["s_a"].max(),
                 "pretanh_own": u[:n].abs().mean(),
                 "pretanh_demo": u[n:].abs().mean(),
                 # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
@@ -413,6 +430,7 @@ def demonstrations(flags):
         return None, 0
     if flags.demos is None:
         settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+        settings["noise"] = flags.demo_noise
         try:
             return pid_demo.record(flags.task, flags.num_demos, **settings, quiet=flags.quiet)
         except ValueError as error:
