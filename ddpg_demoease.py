@@ -74,7 +74,9 @@ class Flags:
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "standard deviation of noise on the actions that demonstrations are recorded "
                                     "with (pid_demo.record); 0, robust: 0.2", low=0)  # fmt: skip
-    conservative: float | None = flag(None, "weight in L_C of loss_conservative; 0, robust: 0.5", low=0)
+    conservative: float | None = flag(None, "weight in L_C of loss_conservative at first; falls linearly to 0 over the "
+                                      "run's first quarter; 0, robust: 0.5", low=0)  # fmt: skip
+    n_step: int | None = flag(None, "rewards before the bootstrapped value in a target of B_o; 1, robust: 10", low=1)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=0)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
@@ -99,12 +101,13 @@ BY_TASK = {  # tab:reward; pnp, which the paper gives to PPO: its sizes, 250 epo
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 BY_RECIPE = {
-    "paper": dict(symmetry="gas", gains="authors", demo_noise=0.0, conservative=0.0, updates_per_step=1.0,
+    "paper": dict(symmetry="gas", gains="authors", demo_noise=0.0, conservative=0.0, n_step=1, updates_per_step=1.0,
                   critic_layernorm=False, clip_target=False, normalize_q=False, lr_decay=False, polyak=0.995),
-    "robust": dict(symmetry="canonical", gains="fast", demo_noise=0.2, conservative=0.5, updates_per_step=0.25,
-                   critic_layernorm=True, clip_target=True, normalize_q=True, lr_decay=True, polyak=0.98),
+    "robust": dict(symmetry="canonical", gains="fast", demo_noise=0.2, conservative=0.5, n_step=10,
+                   updates_per_step=0.25, critic_layernorm=True, clip_target=True, normalize_q=True, lr_decay=True,
+                   polyak=0.98),
 }  # fmt: skip
-QUICK = dict(recipe="robust", epochs=15, lr_decay=False)
+QUICK = dict(recipe="robust", epochs=25)
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
 NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
@@ -143,16 +146,28 @@ def complete(flags):
 
 
 class ReplayBuffer:
-    """Transitions {s, a, r, s', zeta} in a ring, one row each, so that a batch is one gather."""
+    """Transitions {s, a, r, s', zeta} in a ring, one row each, so that a batch is one gather.
 
-    def __init__(self, obs_dim, size):
+    With n_step > 1 (ours) r is the discounted sum of m rewards, m = n_step or what is left of the episode, s' what
+    came m steps later, and zeta = 1 - gamma^(m-1) (1 - its zeta), so that gamma (1 - zeta) is right for any m.
+    """
+
+    def __init__(self, obs_dim, size, n_step=1, gamma=1.0):
         self.rows = torch.zeros(size, 2 * obs_dim + 6)
         self.next, self.filled, self.size = 0, 0, size
+        self.n_step, self.gamma, self.pending = n_step, gamma, []  # pending: s, a, r of the last steps of an episode
 
-    def store(self, s, a, r, s2, terminated):
-        row = np.concatenate((s, a, (r,), s2, (terminated,)), dtype=np.float32, casting="same_kind")
-        self.rows[self.next] = torch.from_numpy(row)
-        self.next, self.filled = (self.next + 1) % self.size, min(self.filled + 1, self.size)
+    def store(self, s, a, r, s2, terminated, truncated=False):
+        self.pending.append((s, a, r))
+        ended = terminated or truncated
+        while self.pending and (ended or len(self.pending) == self.n_step):
+            (s, a, _), m = self.pending[0], len(self.pending)
+            r = sum(self.gamma**i * r for i, (_, _, r) in enumerate(self.pending))
+            zeta = 1 - self.gamma ** (m - 1) * (1 - terminated)
+            row = np.concatenate((s, a, (r,), s2, (zeta,)), dtype=np.float32, casting="same_kind")
+            self.rows[self.next] = torch.from_numpy(row)
+            self.next, self.filled = (self.next + 1) % self.size, min(self.filled + 1, self.size)
+            del self.pending[0]
 
     def sample(self, batch_size, batches):
         """Rows (s, a, r, s', zeta) drawn uniformly, (batches, batch_size, width); zeta is 1 on a true end only."""
@@ -319,14 +334,16 @@ class Learner:
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
+        self.conservative = flags.conservative
 
     def block(self, B_o, B_d, left=1.0):
         """The updates of one block (B_d None: no cloning). Returns the last one's measurements, floats by name.
 
-        left: the fraction of the run that is still to come, for lr_decay.
+        left: the fraction of the run that is still to come, for lr_decay and conservative.
         """
         f = self.flags
         n = max(1, round(f.updates_per_step * f.update_every))
+        self.conservative = f.conservative * max(0.0, 4 * left - 3)
         if f.lr_decay:
             for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
                 group["lr"] = lr * min(1.0, 2 * left)
@@ -362,13 +379,13 @@ class Learner:
         # then those of the mask alone.
         rows_Q = {"s_a": (s, a), "s_pi": (s, a_pi), "own": (s_demo, a_hat.detach()), "demo": (s_demo, a_demo)}
         train = n
-        if f.conservative:
+        if self.conservative:
             rows_Q["s_pi"], train = rows_Q.pop("s_pi"), n + 2 * n_demo
         Q = self.net.Q(*(torch.cat(x) for x in zip(*rows_Q.values(), strict=True)), train, train + n)
         Q = dict(zip(rows_Q, Q.split([len(x) for x, _ in rows_Q.values()]), strict=True))
         L_C = loss_C(Q["s_a"], y)
-        if f.conservative and n_demo:
-            L_C = L_C + f.conservative * loss_conservative(Q["demo"], Q["own"])
+        if self.conservative and n_demo:
+            L_C = L_C + self.conservative * loss_conservative(Q["demo"], Q["own"])
         L_O = L_A = loss_O(Q["s_pi"], f.normalize_q)
         L_BC = M = L_O.new_full((), math.nan)
         if n_demo:
@@ -447,7 +464,7 @@ def demonstrations(flags):
     if found < flags.num_demos:
         logx.fail(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     first = demos["episode"] < flags.num_demos
-    columns = {"obs", "act", "executed", "rew", "obs2", "terminated"} & set(demos)
+    columns = {"obs", "act", "executed", "rew", "obs2", "terminated", "episode"} & set(demos)
     return {name: demos[name][first] for name in columns}, meta["env_steps"]
 
 
@@ -469,7 +486,7 @@ def train(flags, variant=""):
     obs_dim = env.observation_space.shape[0]
     view = gas.canonical if flags.symmetry == "canonical" else lambda obs: obs
     learner = Learner(flags, obs_dim)
-    B_o, B_d = ReplayBuffer(obs_dim, flags.replay_size), None
+    B_o, B_d = ReplayBuffer(obs_dim, flags.replay_size, flags.n_step, flags.gamma), None
     total_steps = flags.epochs * flags.steps_per_epoch
 
     if run.checkpoint:
@@ -490,15 +507,20 @@ def train(flags, variant=""):
         s, _ = env.reset()
         actions = list(state["episode_actions"].numpy())
         for a in actions:
-            s, *_ = env.step(a)
+            s2, r, *_ = env.step(a)
+            B_o.pending.append((view(s), a, r))
+            s = s2
+        B_o.pending = B_o.pending[max(0, len(actions) + 1 - flags.n_step) :]  # the rest is stored
     else:
         if demos:
             B_d = ReplayBuffer(obs_dim, len(demos["rew"]))
             columns = ("obs", "act", "rew", "obs2", "terminated")
             done = demos.get("executed", demos["act"])  # not what the demonstrator asked for, where noise was added
-            for s, a, r, s2, terminated, a_done in zip(*(demos[name] for name in columns), done, strict=True):
+            last = np.append(np.diff(demos["episode"]) != 0, True)  # of its episode
+            rows = zip(*(demos[name] for name in columns), done, last, strict=True)
+            for s, a, r, s2, terminated, a_done, ended in rows:
                 B_d.store(view(s), a, r, view(s2), terminated)
-                B_o.store(view(s), a_done, r, view(s2), terminated)  # both buffers
+                B_o.store(view(s), a_done, r, view(s2), terminated, ended)  # both buffers
         loop = {"t": 0, "episodes": 0, "demo_env_steps": demo_env_steps, "ep_ret": 0.0, "epoch_log": []}
         loop["epoch_episodes"] = []
         env.unwrapped.reset(seed=flags.seed)
@@ -543,7 +565,7 @@ def train(flags, variant=""):
         if not np.all(np.isfinite(a)):
             stop_at_nan("the action")
         s2, r, terminated, truncated, info = env.step(a)
-        B_o.store(view(s), a, r, view(s2), terminated)  # zeta: a timeout is no end to bootstrapping
+        B_o.store(view(s), a, r, view(s2), terminated, truncated)  # zeta: a timeout is no end to bootstrapping
         s = s2
         actions.append(a)
         loop["t"] += 1

@@ -52,7 +52,7 @@ def environment(task, steps=5000, rounds=8):
 
 def update(task, recipe, rounds=15):
     """(seconds of one update in its block, seconds of its matrix products alone, their number, their FLOP)."""
-    flags, _ = ddpg.complete(ddpg.Flags(task=task, recipe=recipe))
+    flags, _ = ddpg.complete(ddpg.Flags(task=task, recipe=recipe, updates_per_step=1))
     width = sum(w for _, w, _ in ddpg.evaluate.OBSERVATION[task])
     learner, buffer = ddpg.Learner(flags, width), ddpg.ReplayBuffer(width, 20_000)
     buffer.rows.normal_(0, 0.3)

@@ -56,9 +56,9 @@ class Paper:
     """
 
     def __init__(self, learner, obs_dim, hidden, gamma, omega, lambda_bc, pi_lr, q_lr, layernorm=False, clip=None,
-                 normalize=False):  # fmt: skip
+                 normalize=False, conservative=0.0):  # fmt: skip
         self.gamma, self.omega, self.lambda_bc = gamma, omega, lambda_bc
-        self.clip, self.normalize = clip, normalize
+        self.clip, self.normalize, self.conservative = clip, normalize, conservative
 
         def copy_of(source, n_in, n_out, norm):
             layers = []
@@ -102,6 +102,9 @@ class Paper:
             M = value(self.q, s_d, a_hat) < value(self.q, s_d, a_d)
             L_BC = torch.sum((a_d[M] - a_hat[M]) ** 2) / (4 * len(s_d))
             L_A = self.lambda_bc * L_BC + L_O
+            if self.conservative:  # the weights of the critic alone see it
+                Q_own, Q_demo = value(self.q, s_d, a_hat.detach()), value(self.q, s_d, a_d)
+                L_C = L_C + self.conservative * torch.sum((Q_own - Q_demo)[~M]) / len(s_d)
             figures = {
                 "L_BC": L_BC,
                 "mask_fraction": M.float().mean(),
@@ -137,7 +140,8 @@ PARTS = {  # flags of the source, and the same in the reimplementation
     "layernorm": (dict(critic_layernorm=True), dict(layernorm=True)),
     "clip": (dict(clip_target=True), dict(clip=True)),
     "normalize": (dict(normalize_q=True), dict(normalize=True)),
-    "robust": (dict(recipe="robust"), dict(layernorm=True, clip=True, normalize=True)),
+    "conservative": (dict(conservative=2.0), dict(conservative=2.0)),
+    "robust": (dict(recipe="robust"), dict(layernorm=True, clip=True, normalize=True, conservative=0.5)),
 }
 
 
@@ -207,6 +211,22 @@ def test_a_saved_learner_goes_on_bit_for_bit():
         learner.update(rows, rows)
         other.update(rows, rows)
     assert torch.equal(learner.net.flat, other.net.flat) and torch.equal(learner.target.flat, other.target.flat)
+
+
+@pytest.mark.parametrize("left, weight", [(1.0, 0.8), (0.9, 0.48), (0.75, 0.0), (0.3, 0.0)])
+def test_the_conservative_term_falls_to_0_over_the_first_quarter_of_the_run(left, weight, monkeypatch):
+    weights, update = [], ddpg.Learner.update
+    monkeypatch.setattr(ddpg.Learner, "update", lambda self, *a, **kw: weights.append(self.conservative)
+                        or update(self, *a, **kw))  # fmt: skip
+    learner, buffer = ddpg.Learner(complete(hidden_sizes=(8,), conservative=0.8), 22), ddpg.ReplayBuffer(22, 10)
+    buffer.load({"rows": batch_of(10, 22, torch.Generator().manual_seed(0))[0], "next": 0})
+    learner.block(buffer, buffer, left=left)
+    assert weights == [pytest.approx(weight)] * 20
+
+
+def test_the_conservative_loss_is_how_far_the_critic_prefers_the_policys_action():
+    Q_demo, Q_own = torch.tensor([1.0, 2.0, -1.0, -3.0]), torch.tensor([0.5, 2.0, -0.5, 3.0])
+    assert ddpg.loss_conservative(Q_demo, Q_own).item() == pytest.approx(6.5 / 4)
 
 
 @pytest.mark.parametrize("decay, left, factor", [(True, 0.25, 0.5), (True, 0.75, 1.0), (True, 0, 0), (False, 0.25, 1)])
@@ -327,6 +347,27 @@ def test_a_row_is_s_a_r_s2_zeta():
     assert buffer.sample(1, 1)[0, 0].tolist() == [*s.tolist(), *a.tolist(), -0.25, *s2.tolist(), 1.0]
 
 
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 9])
+def test_a_row_of_n_steps_gives_the_discounted_rewards_and_the_value_n_steps_on(n):
+    """Three episodes: a true end, a timeout, and one that goes on. gamma (1 - zeta) is what multiplies Q(s')."""
+    gamma, buffer = 0.9, ddpg.ReplayBuffer(22, 50, n, 0.9)
+    rng, episodes = np.random.default_rng(0), [(5, True, False), (4, False, True), (6, False, False)]
+    expected = []
+    for length, terminated, truncated in episodes:
+        s, r, a = rng.normal(size=(length + 1, 22)), rng.normal(size=length), rng.uniform(-1, 1, (length, 4))
+        for t in range(length):
+            end = t == length - 1
+            buffer.store(*(x.astype(np.float32) for x in (s[t], a[t])), r[t], s[t + 1].astype(np.float32),
+                         terminated and end, truncated and end)  # fmt: skip
+        for t in range(length if terminated or truncated else length - n + 1):
+            m = min(n, length - t)
+            discount = 0 if terminated and t + m == length else gamma**m
+            expected.append((*s[t], *a[t], sum(gamma**i * r[t + i] for i in range(m)), *s[t + m], 1 - discount / gamma))
+    assert len(expected) == buffer.filled >= 9
+    np.testing.assert_allclose(buffer.rows[: buffer.filled], np.array(expected), rtol=1e-5, atol=1e-6)
+    assert len(buffer.pending) == min(n - 1, 6)  # of the episode that goes on
+
+
 def test_a_sample_draws_every_filled_row_alike_and_no_other():
     torch.manual_seed(0)
     rewards = filled(7, 50).sample(7, 2000)[..., 26]
@@ -400,9 +441,9 @@ BOTH_TASKS = dict(replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=
                   pi_lr=1e-3, q_lr=1e-3, partitions=4, seed=0, device="cpu", data_dir="data/runs")  # fmt: skip
 RECIPES = {
     "paper": dict(symmetry="gas", gains="authors", critic_layernorm=False, clip_target=False, normalize_q=False,
-                  lr_decay=False, polyak=0.995),
-    "robust": dict(symmetry="so2", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
-                   lr_decay=True, polyak=0.98),
+                  lr_decay=False, polyak=0.995, demo_noise=0, conservative=0, n_step=1, updates_per_step=1),
+    "robust": dict(symmetry="canonical", gains="fast", critic_layernorm=True, clip_target=True, normalize_q=True,
+                   lr_decay=True, polyak=0.98, demo_noise=0.2, conservative=0.5, n_step=10, updates_per_step=0.25),
 }  # fmt: skip
 
 
@@ -417,7 +458,7 @@ def test_defaults_are_those_of_the_papers_table_and_the_recipe(task, recipe):
 
 def test_quick_is_a_short_run_of_the_robust_recipe():
     flags = vars(complete(quick=True))
-    expected = DEFAULTS["p2p"] | RECIPES["robust"] | dict(recipe="robust", epochs=15, lr_decay=False)
+    expected = DEFAULTS["p2p"] | RECIPES["robust"] | dict(recipe="robust", epochs=25)
     assert {name: flags[name] for name in expected} == expected
 
 
@@ -438,11 +479,11 @@ def test_a_very_short_episode_still_updates():
 
 @pytest.mark.parametrize("given, name", [
     (dict(), "p2p-ddpg-paper-N100-lambda1.8-gas-seed0"),
-    (dict(recipe="robust", seed=7), "p2p-ddpg-robust-N100-lambda1.8-so2-seed7"),
+    (dict(recipe="robust", seed=7), "p2p-ddpg-robust-N100-lambda1.8-canonical-seed7"),
     (dict(task="p2po", symmetry="canonical", recipe="robust"), "p2po-ddpg-robust-N250-lambda2-canonical-seed0"),
     (dict(task="pnp", num_demos=15, lambda_bc=0.5), "pnp-ddpg-paper-N15-lambda0.5-gas-seed0"),
     (dict(num_demos=0, lambda_bc=0.0), "p2p-ddpg-paper-N0-lambda0-gas-seed0"),
-    (dict(quick=True), "p2p-ddpg-robust-N100-lambda1.8-so2-seed0-quick"),
+    (dict(quick=True), "p2p-ddpg-robust-N100-lambda1.8-canonical-seed0-quick"),
     (dict(name="mine", seed=7), "mine"),
     (dict(epochs=9, data_dir="x", quiet=True, eval_every=0, resume=True), "p2p-ddpg-paper-N100-lambda1.8-gas-seed0"),
 ])  # fmt: skip
@@ -454,7 +495,8 @@ def test_the_default_names_of_runs_that_differ_in_any_setting_differ_and_can_be_
     changes = dict(gamma=0.9, gains="fast", hidden_sizes=(8, 8), critic_layernorm=True, demos="some/where/demos.npz",
                    partitions=8, max_ep_len=100, update_every=3, start_steps=10, update_after=10, steps_per_epoch=300,
                    replay_size=500, batch_size=10, demo_batch_size=10, act_noise=0.2, polyak=0.9, pi_lr=1e-4, q_lr=1e-4,
-                   clip_target=True, normalize_q=True)  # fmt: skip
+                   clip_target=True, normalize_q=True, demo_noise=0.1, conservative=0.1, n_step=2,
+                   updates_per_step=0.5)  # fmt: skip
     names = [complete().name] + [complete(**{key: value}).name for key, value in changes.items()]
     assert len(set(names)) == len(names)
     for name in (*names, complete(**changes).name):
@@ -634,6 +676,30 @@ def test_demonstrations_go_into_both_buffers_failed_ones_too(world, monkeypatch,
     assert {row["demo_env_steps"] for row in rows_of(folder / "progress.csv")} == {"18"}
 
 
+def test_B_o_holds_what_was_done_and_B_d_what_the_demonstrator_asked_for(world, monkeypatch):
+    demos = demo_arrays()
+    demos["executed"] = demos["act"] + 0.1
+    monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: (demos, 18))
+    folder, _ = world("a", num_demos=4, symmetry="none")
+    assert torch.equal(stored(folder, "B_d")[:, 22:26], torch.from_numpy(demos["act"]))
+    assert torch.equal(stored(folder)[:18, 22:26], torch.from_numpy(demos["executed"]))
+
+
+def test_windows_of_n_steps_end_with_their_demonstration_or_episode(world, monkeypatch):
+    monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: (demo_arrays(), 18))
+    folder, env = world("a", num_demos=4, n_step=4, symmetry="none")
+    rows, demos = stored(folder), demo_arrays()
+    expected = ddpg.ReplayBuffer(22, 200, 4, TINY.get("gamma", 0.99))
+    ended = np.isin(np.arange(18), np.cumsum(demos["length"]) - 1) & ~demos["terminated"]
+    for row in zip(*(demos[name] for name in ("obs", "act", "rew", "obs2", "terminated")), ended, strict=True):
+        expected.store(*row)
+    assert expected.filled == 18 and expected.pending == []
+    for x in env.steps:
+        expected.store(x.s, x.a, x.r, x.s2, x.terminated, x.truncated)
+    assert torch.equal(rows, expected.rows[: expected.filled]) and len(rows) > 18 + 110
+    assert torch.equal(stored(folder, "B_d")[:, 26], torch.from_numpy(demos["rew"].astype(np.float32)))  # one step
+
+
 def test_the_ring_of_a_run_keeps_the_newest_steps(world):
     folder, env = world("a", replay_size=50)
     kept = {tuple(row) for row in stored(folder).tolist()}
@@ -678,6 +744,16 @@ def test_updates_begin_at_update_after_itself_where_a_block_is_due(world, monkey
     monkeypatch.setattr(ddpg.Learner, "block", lambda *a, **kw: blocks.append(a[1].filled) or block(*a, **kw))
     world("a", update_after=28, update_every=7, epochs=1, steps_per_epoch=60)
     assert blocks == [28, 35, 42, 49, 56]
+
+
+@pytest.mark.parametrize("per_step, updates", [(0.25, 2), (2, 14), (0.01, 1)])
+def test_a_block_makes_updates_per_step_times_as_many_updates_as_steps_and_at_least_one(
+    world, monkeypatch, per_step, updates
+):
+    made, update = [], ddpg.Learner.update
+    monkeypatch.setattr(ddpg.Learner, "update", lambda *a, **kw: made.append(0) or update(*a, **kw))
+    world("a", update_after=60, update_every=7, updates_per_step=per_step)
+    assert len(made) == updates * len(range(63, 121, 7))
 
 
 @pytest.mark.parametrize("symmetry", ["so2", "none"])
@@ -794,6 +870,17 @@ def test_an_interrupted_run_resumes_as_if_it_had_never_stopped(plain, world, num
     assert json.loads(saved["loop"])["t"] == at
     folder, env = world("a", resume=True)
     assert env.exit_code is None and curves(folder) == curves(plain[0])
+
+
+@pytest.mark.parametrize("at", [3, 8, 63, 80, 81])
+def test_the_rows_that_wait_for_their_n_steps_come_back_on_a_resume(world, at):
+    """At 3 and 8 before n = 10 steps are done, else in the middle of windows."""
+    whole, _ = world("whole", n_step=10)
+    folder, env = world("a", n_step=10, at_step=lambda n: signal.raise_signal(signal.SIGINT) if n == at else None)
+    assert env.exit_code == 130
+    folder, env = world("a", n_step=10, resume=True)
+    assert env.exit_code is None and curves(folder) == curves(whole)
+    assert torch.equal(stored(folder), stored(whole))
 
 
 def test_after_a_run_an_interrupt_is_an_interrupt_again(world):

@@ -33,8 +33,8 @@ TINY_PPO = ["--hidden_sizes", 16, 16, "--epochs", 6, "--steps_per_epoch", 40, "-
 TINY_PPO += ["--gains", "fast", "--train_iters", 3, "--batch_size", 32, "--demo_batch_size", 32, "--eval_every", 0]
 TINY_PPO += ["--checkpoint_every", 1, "--quiet"]
 AGENTS = {
-    "so2": ["--recipe", "robust"],
-    "canonical": ["--recipe", "robust", "--symmetry", "canonical"],
+    "so2": ["--recipe", "robust", "--symmetry", "so2"],
+    "canonical": ["--recipe", "robust"],
     "plain": ["--num_demos", "0", "--lambda_bc", "0"],
     "p2po": ["--task", "p2po", "--recipe", "robust", "--act_noise", 2],
     "ppo paper": ["--task", "pnp", "--demos_per_epoch", 1],
