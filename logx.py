@@ -23,6 +23,7 @@ import time
 import types
 import typing
 import warnings
+import zlib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -81,6 +82,29 @@ def check_ranges(flags):
                     f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None
                 )
                 fail(f"--{field.name} {x}: must be {allowed or 'a finite number'}")
+
+
+# What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
+NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
+NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
+
+
+def name_run(flags, printed, algo):
+    """Gives the flags a name where they have none. Returns the variant: what differs from `printed`, the recipe's own.
+    Exits with 2 where the name is no folder's or the device is not here."""
+    asked = dataclasses.asdict(flags).items()
+    changed = {key: value for key, value in asked if key not in NOT_A_VARIANT and value != getattr(printed, key)}
+    variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
+    if len(variant) > 80:
+        variant = f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
+    if flags.name is None:
+        flags.name = f"{flags.task}-{algo}-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
+        flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
+    if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
+        fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
+    if flags.device == "cuda" and not torch.cuda.is_available():
+        fail("--device cuda: torch sees no GPU here; use --device cpu")
+    return variant
 
 
 def atomic_write(path, write):

@@ -178,6 +178,34 @@ def load_demos(path, task):
     return demos, meta
 
 
+def demonstrations(flags):
+    """(arrays of N_demos episodes, real environment steps they took): read from flags.demos, a file, else recorded.
+
+    flags: as of the algorithm scripts. (None, 0) for no demonstrations. Raises ValueError, its text begins with the
+    name of the flag that is wrong.
+    """
+    if not flags.num_demos:
+        return None, 0
+    if flags.demos is None:
+        settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+        return record(flags.task, flags.num_demos, **settings, noise=flags.demo_noise, quiet=flags.quiet)
+    try:
+        demos, meta = load_demos(flags.demos, flags.task)
+    except ValueError as error:
+        raise ValueError(f"demos {error}") from None
+    if "gas" in (flags.symmetry, meta["symmetry"]) and meta["partitions"] != flags.partitions:
+        found = meta["partitions"]
+        raise ValueError(f"demos {flags.demos}: of {found} partitions, not --partitions {flags.partitions}")
+    if flags.symmetry == "gas" and meta["symmetry"] != "gas":
+        demos = gas.aggregate(demos, flags.partitions)
+    found = len(demos["length"])
+    if found < flags.num_demos:
+        raise ValueError(f"demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
+    first = demos["episode"] < flags.num_demos
+    columns = {"obs", "act", "executed", "rew", "obs2", "terminated", "episode"} & set(demos)
+    return {name: demos[name][first] for name in columns}, meta["env_steps"]
+
+
 def frames(agents, seeds, every):
     """The pictures (height, width, 3) uint8 of episodes, one in `every` steps, the agents' side by side.
 

@@ -18,7 +18,6 @@ import json
 import math
 import signal
 import sys
-import zlib
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -114,9 +113,6 @@ BY_RECIPE = {
                    normalize_obs=True, grasp_input=True, clip_value=True),
 }  # fmt: skip
 QUICK = dict(recipe="robust", epochs=5)
-# What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
-NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
-NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
 
 
 def fill_in(flags):
@@ -135,20 +131,9 @@ def complete(flags):
     flags.hidden_sizes = tuple(flags.hidden_sizes)
     logx.check_ranges(flags)
     printed = fill_in(Flags(task=flags.task, recipe=flags.recipe, num_demos=flags.num_demos, quick=flags.quick))
-    changed = {k: v for k, v in asdict(flags).items() if k not in NOT_A_VARIANT and v != getattr(printed, k)}
-    variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
-    if len(variant) > 80:
-        variant = f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
-    if flags.name is None:
-        flags.name = f"{flags.task}-ppo-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
-        flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
     if flags.grasp_input and flags.task != "pnp":
         logx.fail(f"--grasp_input: on --task pnp only, not {flags.task}, which has nothing to grasp")
-    if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
-        logx.fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
-    if flags.device == "cuda" and not torch.cuda.is_available():
-        logx.fail("--device cuda: torch sees no GPU here; use --device cpu")
-    return flags, variant
+    return flags, logx.name_run(flags, printed, "ppo")
 
 
 # ---- replay buffers (B_o, B_d) ---------------------------------------------------------------------------------------
@@ -433,39 +418,15 @@ class Learner:
 # ---- training loop ---------------------------------------------------------------------------------------------------
 
 
-def demonstrations(flags):
-    """(arrays of N_demos episodes, real environment steps they took): read from --demos, else recorded."""
-    if not flags.num_demos:
-        return None, 0
-    if flags.demos is None:
-        settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
-        settings["noise"] = flags.demo_noise
-        try:
-            return pid_demo.record(flags.task, flags.num_demos, **settings, quiet=flags.quiet)
-        except ValueError as error:
-            logx.fail(f"--{error}")
-    try:
-        demos, meta = pid_demo.load_demos(flags.demos, flags.task)
-    except ValueError as error:
-        logx.fail(f"--demos {error}")
-    if "gas" in (flags.symmetry, meta["symmetry"]) and meta["partitions"] != flags.partitions:
-        logx.fail(f"--demos {flags.demos}: of {meta['partitions']} partitions, not --partitions {flags.partitions}")
-    if flags.symmetry == "gas" and meta["symmetry"] != "gas":
-        demos = gas.aggregate(demos, flags.partitions)
-    found = len(demos["length"])
-    if found < flags.num_demos:
-        logx.fail(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
-    first = demos["episode"] < flags.num_demos
-    columns = {"obs", "act", "executed", "rew", "obs2", "terminated", "episode"} & set(demos)
-    return {name: demos[name][first] for name in columns}, meta["env_steps"]
-
-
 def train(flags, variant=""):
     """Runs ag:d-ease-on to the end, or on from the checkpoint. Returns the run's folder."""
     config = asdict(flags) | {"algo": "ppo", "variant": variant}
     folder = Path(flags.data_dir) / flags.name
     if logx.is_new(folder, flags.resume):  # before the folder is made: there is nothing to undo if --demos is no good
-        demos, demo_env_steps = demonstrations(flags)
+        try:
+            demos, demo_env_steps = pid_demo.demonstrations(flags)
+        except ValueError as error:
+            logx.fail(f"--{error}")
         if demos and flags.demos_in_B_o and "executed" in demos:
             logx.fail("--demos_in_B_o: B_o would not hold what was done where demonstrations were recorded with noise; "
                       "use --no-demos_in_B_o or --demo_noise 0")  # fmt: skip

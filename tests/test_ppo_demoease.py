@@ -25,6 +25,7 @@ from torch.distributions import Normal, kl_divergence
 
 import evaluate
 import gas
+import logx
 import pid_demo
 import ppo_demoease as ppo
 
@@ -748,7 +749,7 @@ CHANGES = dict(gamma=0.9, gains="fast", hidden_sizes=(8, 8), demos="some/where/d
 
 def test_the_default_names_of_runs_that_differ_in_any_setting_differ_and_can_be_folders(tmp_path):
     names = [complete().name] + [complete(**{key: value}).name for key, value in CHANGES.items()]
-    assert len(set(names)) == len(names) and set(CHANGES) | ppo.NOT_A_VARIANT == set(vars(complete()))
+    assert len(set(names)) == len(names) and set(CHANGES) | logx.NOT_A_VARIANT == set(vars(complete()))
     for name in (*names, complete(**CHANGES).name):
         (tmp_path / name).mkdir()  # also with every flag of them at once: no longer than a file name may be
 
@@ -1041,7 +1042,7 @@ def test_demonstrations_with_noise_do_not_go_into_B_o(world, capsys):
 def test_the_demonstrator_is_that_of_the_recipe(recipe, settings, monkeypatch):
     asked = []
     monkeypatch.setattr(pid_demo, "record", lambda *args, **kwargs: asked.append((args, kwargs)) or ({}, 0))
-    ppo.demonstrations(complete(recipe=recipe, num_demos=9, seed=4, partitions=6, quiet=True))
+    pid_demo.demonstrations(complete(recipe=recipe, num_demos=9, seed=4, partitions=6, quiet=True))
     assert asked == [(("pnp", 9), settings | dict(seed=4, partitions=6, quiet=True))]
 
 
