@@ -2,13 +2,15 @@
 
     python ddpg_demoease.py --task p2p --quick                                 # a few minutes, to see it learn
     python ddpg_demoease.py --task p2p --recipe robust --epochs 50             # 100,000 steps
+    python ddpg_demoease.py --task p2po --recipe robust --epochs 80            # 200,000 steps
     python ddpg_demoease.py --task p2p --recipe paper                          # as printed: 250 epochs, 500,000 steps
     python ddpg_demoease.py --task p2p --num_demos 0 --lambda_bc 0             # plain DDPG
     python ddpg_demoease.py --task p2p --seed 1 --resume                       # goes on where it was stopped
 
-Two recipes. `paper` is the algorithm as printed. `robust` adds six parts, each a flag of its own: LayerNorm in the
-critic, Bellman targets clipped to possible returns, faster target networks, L_O divided by |mean Q|, learning rates
-that fall to 0 in the second half, and a symmetry for the networks; its demonstrations come from the faster PID gains.
+Two recipes. `paper` is the algorithm as printed. `robust` adds parts, each a flag of its own: targets of ten steps, a
+critic that is conservative on demonstrations at first, noise while demonstrations are recorded, one update in four
+steps, LayerNorm in the critic, targets clipped to possible returns, faster target networks, L_O divided by |mean Q|,
+learning rates that fall to 0 in the second half, the faster PID gains, and the arm's own frame for the networks.
 README.md has every measured figure, with the minutes it took, and the list of differences from the paper.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
@@ -76,7 +78,7 @@ class Flags:
     conservative: float | None = flag(None, "weight in L_C of loss_conservative at first; falls linearly to 0 over the "
                                       "run's first quarter; 0, robust: 0.5", low=0)  # fmt: skip
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target of B_o; 1, robust: 10", low=1)
-    updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=0)
+    updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip Bellman targets to the range of possible returns")
     normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
@@ -89,7 +91,7 @@ class Flags:
     eval_every: int = flag(5, "epochs between test trials; 0 never", low=0)
     eval_trials: int = flag(50, low=1)
     checkpoint_every: int = flag(5, "epochs", low=1)
-    quick: bool = flag(False, "a few minutes: the robust recipe, 15 epochs, then test trials and a GIF of the agent")
+    quick: bool = flag(False, "a few minutes: the robust recipe, 25 epochs, then test trials and a GIF of the agent")
     quiet: bool = flag(False, "no progress bar and table")
     tensorboard: bool = flag(False)
 
@@ -321,13 +323,12 @@ class Learner:
         self.return_range = (-4.0, TASKS[flags.task].return_max)
         self.conservative = flags.conservative
 
-    def block(self, B_o, B_d, left=1.0):
-        """The updates of one block (B_d None: no cloning). Returns the last one's measurements, floats by name.
+    def block(self, B_o, B_d, n, left=1.0):
+        """n updates (B_d None: no cloning). Returns the last one's measurements, floats by name.
 
         left: the fraction of the run that is still to come, for lr_decay and conservative.
         """
         f = self.flags
-        n = max(1, round(f.updates_per_step * f.update_every))
         self.conservative = f.conservative * max(0.0, 4 * left - 3)
         if f.lr_decay:
             for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
@@ -551,8 +552,13 @@ def train(flags, variant=""):
             actions, loop["ep_ret"] = [], 0.0
 
         # update
-        if t >= flags.update_after and t % flags.update_every == 0:
-            measured = learner.block(B_o, B_d, 1 - t / total_steps)
+        if t >= flags.update_after and t % flags.update_every == 0 and B_o.filled:
+            due = (math.floor(flags.updates_per_step * steps) for steps in (t, t - flags.update_every))
+            n = next(due) - next(due)
+        else:
+            n = 0
+        if n:
+            measured = learner.block(B_o, B_d, n, 1 - t / total_steps)
             loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
                 stop_at_nan("a loss")

@@ -52,13 +52,13 @@ def environment(task, steps=5000, rounds=8):
 
 def update(task, recipe, rounds=15):
     """(seconds of one update in its block, seconds of its matrix products alone, their number, their FLOP)."""
-    flags, _ = ddpg.complete(ddpg.Flags(task=task, recipe=recipe, updates_per_step=1))
+    flags, _ = ddpg.complete(ddpg.Flags(task=task, recipe=recipe))
     width = sum(w for _, w, _ in ddpg.evaluate.OBSERVATION[task])
     learner, buffer = ddpg.Learner(flags, width), ddpg.ReplayBuffer(width, 20_000)
     buffer.rows.normal_(0, 0.3)
     buffer.rows[:, -1] = 0
     buffer.filled = len(buffer.rows)
-    learner.block(buffer, buffer)
+    learner.block(buffer, buffer, flags.update_every)
     with Products() as products:
         learner.update(buffer.sample(100, 1)[0], buffer.sample(100, 1)[0])
     whole = alone = float("inf")
@@ -66,7 +66,7 @@ def update(task, recipe, rounds=15):
         flop = sum(2 * a.shape[0] * a.shape[1] * b.shape[1] for a, b, _ in products.calls)
     for _ in range(rounds):
         begin = time.perf_counter()
-        learner.block(buffer, buffer)
+        learner.block(buffer, buffer, flags.update_every)
         whole = min(whole, (time.perf_counter() - begin) / flags.update_every)
         begin = time.perf_counter()
         with torch.inference_mode():

@@ -220,8 +220,8 @@ def test_the_conservative_term_falls_to_0_over_the_first_quarter_of_the_run(left
                         or update(self, *a, **kw))  # fmt: skip
     learner, buffer = ddpg.Learner(complete(hidden_sizes=(8,), conservative=0.8), 22), ddpg.ReplayBuffer(22, 10)
     buffer.load({"rows": batch_of(10, 22, torch.Generator().manual_seed(0))[0], "next": 0})
-    learner.block(buffer, buffer, left=left)
-    assert weights == [pytest.approx(weight)] * 20
+    learner.block(buffer, buffer, 3, left)
+    assert weights == [pytest.approx(weight)] * 3
 
 
 def test_the_conservative_loss_is_how_far_the_critic_prefers_the_policys_action():
@@ -234,7 +234,7 @@ def test_lr_decay_lets_both_learning_rates_fall_to_0_over_the_second_half_of_the
     flags = complete(hidden_sizes=(8,), pi_lr=2e-3, q_lr=5e-3, lr_decay=decay, update_every=2, symmetry="none")
     learner, buffer = ddpg.Learner(flags, 22), ddpg.ReplayBuffer(22, 10)
     buffer.load({"rows": batch_of(10, 22, torch.Generator().manual_seed(0))[0], "next": 0})
-    learner.block(buffer, buffer, left=left)
+    learner.block(buffer, buffer, 2, left)
     assert [group["lr"] for group in learner.optimizer.param_groups] == [2e-3 * factor, 5e-3 * factor]
 
 
@@ -746,14 +746,18 @@ def test_updates_begin_at_update_after_itself_where_a_block_is_due(world, monkey
     assert blocks == [28, 35, 42, 49, 56]
 
 
-@pytest.mark.parametrize("per_step, updates", [(0.25, 2), (2, 14), (0.01, 1)])
-def test_a_block_makes_updates_per_step_times_as_many_updates_as_steps_and_at_least_one(
-    world, monkeypatch, per_step, updates
-):
+@pytest.mark.parametrize("per_step, updates", [(1, 63), (0.25, 15), (2, 126), (0.01, 1), (0.001, 0)])
+def test_updates_keep_up_with_updates_per_step_times_the_steps(world, monkeypatch, per_step, updates):
+    """Blocks at 63, 70, ..., 119: floor(0.25 * 119) - floor(0.25 * 56) = 15."""
     made, update = [], ddpg.Learner.update
     monkeypatch.setattr(ddpg.Learner, "update", lambda *a, **kw: made.append(0) or update(*a, **kw))
     world("a", update_after=60, update_every=7, updates_per_step=per_step)
-    assert len(made) == updates * len(range(63, 121, 7))
+    assert len(made) == updates
+
+
+def test_there_is_no_update_before_the_first_row_of_n_steps(world):
+    _, env = world("a", update_after=0, update_every=1, n_step=30)
+    assert env.exit_code is None
 
 
 @pytest.mark.parametrize("symmetry", ["so2", "none"])
