@@ -35,7 +35,7 @@ HERE = Path(__file__).resolve().parent
 SCRIPTS = {"ddpg": "ddpg_demoease.py", "ppo": "ppo_demoease.py"}
 # Epochs and steps an epoch where no flag says otherwise (tab:reward, tab:reward2), and each recipe's symmetry.
 LENGTH = {"p2p": (250, 2000), "p2po": (500, 2500), "pnp": (50, 4000)}
-SYMMETRY = {"paper": {"ddpg": "gas", "ppo": "gas"}, "robust": {"ddpg": "so2", "ppo": "canonical"}}
+SYMMETRY = {"paper": "gas", "robust": "canonical"}  # where --symmetry says nothing
 OWN = "task recipe symmetry num_demos lambda_bc seed epochs steps_per_epoch name data_dir resume quiet quick".split()
 STOPPED = 130  # exit code of a run that was asked to stop, and saved its state
 
@@ -134,7 +134,7 @@ def grid(flags):
                 continue
             # P2P's "N_demos = 0, lambda = 1" is plain DDPG like the baseline: its seeds are others
             first = flags.first_seed + (100 if (N, lam) == (0, 1) else 0)
-            symmetry = flags.symmetry or SYMMETRY[flags.recipe][algo]
+            symmetry = flags.symmetry or SYMMETRY[flags.recipe]
             given = dict(symmetry=flags.symmetry, epochs=flags.epochs, steps_per_epoch=flags.steps_per_epoch)
             own = dict(task=task, recipe=flags.recipe, num_demos=N, lambda_bc=f"{lam:g}", data_dir=flags.data_dir)
             own |= {key: value for key, value in given.items() if value}
