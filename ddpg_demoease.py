@@ -552,12 +552,8 @@ def train(flags, variant=""):
             actions, loop["ep_ret"] = [], 0.0
 
         # update
-        if t >= flags.update_after and t % flags.update_every == 0 and B_o.filled:
-            due = (math.floor(flags.updates_per_step * steps) for steps in (t, t - flags.update_every))
-            n = next(due) - next(due)
-        else:
-            n = 0
-        if n:
+        n = math.floor(flags.updates_per_step * t) - math.floor(flags.updates_per_step * (t - flags.update_every))
+        if n and t >= flags.update_after and t % flags.update_every == 0 and B_o.filled:
             measured = learner.block(B_o, B_d, n, 1 - t / total_steps)
             loop["epoch_log"].append(measured)
             if not math.isfinite(measured["L_A"] + measured["L_C"]):
