@@ -122,6 +122,8 @@ class Process:
                 os.kill(self.pid, signal.SIGKILL)
                 raise AssertionError("the script does not end")
             time.sleep(0.005)
+        if self.code:
+            print(f"exit code {self.code}: {self.err.strip()}")  # pytest -rP shows what each case printed
         return self.code
 
     @property
