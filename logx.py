@@ -81,7 +81,8 @@ def check_ranges(flags):
                 allowed = " and ".join(
                     f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None
                 )
-                fail(f"--{field.name} {x}: must be {allowed or 'a finite number'}")
+                finite = "" if math.isfinite(x) else "a finite number" + " " * bool(allowed)
+                fail(f"--{field.name} {x}: must be {finite}{allowed}")
 
 
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.

@@ -156,6 +156,8 @@ def record(
 def load_demos(path, task):
     """The arrays of a demonstration file and its `meta`. Raises ValueError with what is wrong with the file."""
     try:
+        if os.path.isfile(path) and not zipfile.is_zipfile(path):
+            raise ValueError("it is no .npz, or one cut short")
         with np.load(path, allow_pickle=False) as file:
             demos = {name: file[name] for name in file.files}
         meta = json.loads(str(demos.pop("meta")))
@@ -167,12 +169,16 @@ def load_demos(path, task):
         shapes |= {"executed": (rows, 4)} if "executed" in demos else {}
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
-        if any(demos[name].shape != shape or not np.all(np.isfinite(demos[name])) for name, shape in shapes.items()):
-            raise ValueError("its arrays do not fit together")
+        for name, shape in shapes.items():
+            if demos[name].shape != shape:
+                raise ValueError(f"its {name} is {demos[name].shape}, {shape} is expected")
+            if not np.all(np.isfinite(demos[name])):
+                raise ValueError(f"nan or inf in its {name}")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: not a demonstration file of pid_demo.py --record ({error})") from None
+        lacks = "it lacks " * isinstance(error, KeyError)
+        raise ValueError(f"{path}: not a demonstration file of pid_demo.py --record ({lacks}{error})") from None
     if meta["task"] != task:
         raise ValueError(f"{path}: recorded on task {meta['task']}, not {task}")
     return demos, meta

@@ -611,10 +611,14 @@ NUMBERS = """--seed -1, --seed 4294967296, --seed x, --gamma 1.5, --gamma -0.1, 
 BAD = [(line.split(), line.split()[0]) for line in NUMBERS.replace("\n", "").split(",")]
 BAD += [(["--name", name], "--name") for name in ("a/b", "..", ".", "")]
 BAD += [(["--name", "x" * 300], "x")]
-BAD += [(["--demos", f"{{material}}/{name}"], name) for name in (
-    "missing.npz", "p2po.npz", "nan_obs.npz", "nan_act.npz", "nan_rew.npz", "nan_obs2.npz", "short.npz", "wide.npz",
-    "narrow.npz", "objects.npz", "none.npz", "no_meta.npz", "empty_meta.npz", "no_act.npz", "truncated.npz",
-    "empty.npz", "text.npz", "array.npy")]  # fmt: skip
+BAD += [(["--demos", f"{{material}}/{name}"], says) for name, says in {
+    "missing.npz": "missing.npz: no such file", "p2po.npz": "its obs is", "nan_obs.npz": "nan or inf in its obs",
+    "nan_act.npz": "nan or inf in its act", "nan_rew.npz": "nan or inf in its rew",
+    "nan_obs2.npz": "nan or inf in its obs2", "short.npz": "its act is", "wide.npz": "its act is",
+    "narrow.npz": "its obs is", "objects.npz": "Object arrays", "none.npz": "gives 0 episodes",
+    "no_meta.npz": "it lacks 'meta'", "empty_meta.npz": "it lacks 'task'", "no_act.npz": "it lacks 'task'",
+    "truncated.npz": "no .npz", "empty.npz": "no .npz", "text.npz": "no .npz",
+    "array.npy": "no .npz"}.items()]  # fmt: skip
 BAD += [
     (["--demos", "{material}"], "--demos"),
     (["--demos", "{material}/two.npz", "--num_demos", "3"], "--num_demos"),
