@@ -907,7 +907,10 @@ def publish(sources):
     configs = {path.parent: read_config(path) for path in sorted(RESULTS.glob("[!.]*/config.json"))}
     rows = [index_row(read_run(folder, config), config) for folder, config in configs.items()]
     best = {}  # the run of each task and recipe that keeps its weights
-    for row in (row for row in rows if (RESULTS / row["name"] / "policy.pt").exists()):
+    for row in rows:
+        folder = RESULTS / row["name"]
+        if not (folder / "policy.pt").exists() or configs[folder]["quick"]:
+            continue
         best.setdefault((row["task"], row["recipe"]), []).append((-float(row["P_scs_percent"] or -1), row["name"]))
     kept = [RESULTS / min(names)[1] / "policy.pt" for names in best.values()]
     for path in set(RESULTS.glob("*/policy.pt")) - set(kept):

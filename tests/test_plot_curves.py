@@ -500,13 +500,14 @@ def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_
     assert row["git_commit"] == COMMIT["versions"]["git_commit"]
 
 
-def test_only_the_best_run_of_a_task_and_recipe_keeps_its_policy_and_an_unfinished_one_is_said_so(tmp_path, capsys):
+def test_only_the_best_run_keeps_its_policy_no_quick_one_and_an_unfinished_one_is_said_so(tmp_path, capsys):
     runs = [write_publishable(tmp_path / f"runs/{i}", seed=i, success=won) for i, won in enumerate([(1, 0), (1, 1)])]
     runs.append(write_publishable(tmp_path / "runs/2", recipe="paper", success=(0, 0), epochs=3))
+    runs.append(write_publishable(tmp_path / "runs/0-quick", success=(1, 1), seed=3, quick=True))
     for run in runs:
         plot_curves.main(["--publish", str(run)])
     assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
-    assert [row["finished"] for row in csv.DictReader((tmp_path / "results/index.csv").open())] == ["1", "1", "0"]
+    assert [row["finished"] for row in csv.DictReader((tmp_path / "results/index.csv").open())] == ["1", "1", "1", "0"]
 
 
 def test_a_better_run_that_was_published_without_weights_leaves_them_to_the_next(tmp_path, capsys):
