@@ -145,6 +145,7 @@ class ReplayBuffer:
         self.n_step, self.gamma, self.pending = n_step, gamma, []  # pending: s, a, r of the last steps of an episode
 
     def store(self, s, a, r, s2, terminated, truncated=False):
+        """One step: s, s2 (obs_dim,), a (4,), float32. Its row is written once its n_step rewards are known."""
         self.pending.append((s, a, r))
         ended = terminated or truncated
         while self.pending and (ended or len(self.pending) == self.n_step):
@@ -162,6 +163,7 @@ class ReplayBuffer:
         return self.rows[i].view(batches, -1, self.rows.shape[1])
 
     def state(self):
+        """For a checkpoint: all but `pending`, which the replayed episode gives back."""
         return {"rows": self.rows[: self.filled].clone(), "next": self.next}  # of a view, all would be stored
 
     def load(self, state):
@@ -260,9 +262,11 @@ class ActorCritic(nn.Module):
         self.mu.grad, self.nu.grad = self.grad[:n], self.grad[n:]
 
     def pre_tanh(self, s):
+        """u of s (n, obs_dim): (n, 4)."""
         return _Forward.apply(s, self.mu, self.layers[self.u], len(s), len(s))
 
     def pi(self, s):
+        """pi_mu(s) of s (n, obs_dim): (n, 4)."""
         return torch.tanh(self.pre_tanh(s))
 
     def Q(self, s, a, train=0, alive=0):
@@ -272,6 +276,7 @@ class ActorCritic(nn.Module):
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
+# Q, y and M are (n,), actions (n, 4); a loss is a scalar tensor.
 
 
 def loss_C(Q_s_a, y):

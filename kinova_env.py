@@ -368,6 +368,7 @@ class KinovaEnv(gymnasium.Env):
     # ---- Gymnasium ------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed=None, options=None):
+        """(observation, info); options as in the class's docstring. Raises ValueError that names an unreachable one."""
         super().reset(seed=seed)
         options = options or {}
         self._check_options(options)
@@ -421,6 +422,7 @@ class KinovaEnv(gymnasium.Env):
         )
 
     def step(self, action):
+        """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it has a NaN."""
         a1, a2, a3, a5 = action.tolist() if isinstance(action, np.ndarray) else action
         if a1 != a1 or a2 != a2 or a3 != a3 or a5 != a5:
             raise ValueError(f"action {action!r}: has a NaN")

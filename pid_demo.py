@@ -88,6 +88,7 @@ class PID:
         return found[np.argmin(wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1))]
 
     def act(self):
+        """The action (4,) float32 for the environment's present state."""
         if self._episode != self.env.episode:
             self._episode, self._goal, self._integral = self.env.episode, None, np.zeros(4)
         if self.env.row.cube == "obstacle":

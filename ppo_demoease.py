@@ -150,6 +150,7 @@ class TrajectoryBuffer:
         self.filled = 0
 
     def store(self, s, a, r, s2, terminated, end, own):
+        """One step: s, s2 (obs_dim,), a (4,), float32."""
         row = np.concatenate((s, a, (r,), s2, (terminated, end, own)), dtype=np.float32, casting="same_kind")
         self.store_rows(torch.from_numpy(row[None]))
 
@@ -216,13 +217,15 @@ class ActorCritic(nn.Module):
         return torch.cat((x, grasped(s).unsqueeze(-1).float()), dim=-1) if self.grasp_input else x
 
     def mu(self, s):
+        """The mean action of s (n, obs_dim): (n, 4), not bounded."""
         return self.mu_net(self.inputs(s))
 
     def V(self, s):
+        """V_nu of s (n, obs_dim): (n,)."""
         return self.v_net(self.inputs(s)).squeeze(-1)
 
     def log_prob(self, mu, a):
-        """log pi(a|s), (n,)."""
+        """log pi(a|s) of mu, a (n, 4): (n,)."""
         z = (a - mu) / self.log_std.exp()
         return -(0.5 * z**2 + self.log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
@@ -234,6 +237,7 @@ class ActorCritic(nn.Module):
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
+# V, R, A, ratio and M are (n,), actions (n, 4); a loss is a scalar tensor.
 
 
 def loss_C(V_s, R):
