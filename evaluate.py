@@ -214,7 +214,7 @@ def print_table(results, versus=None):
     print(f"{'agent':{width}} trials  {'P_scs %':21}{'T_eff':20}{'R_test':21}{'E_95 cm':19}{'steps':18}failures")
     for name, rows in results.items():
         m, ends = metrics(rows), intervals(rows)
-        cells = [cell(m[key], *ends[key], d=d).ljust(w) for key, d, w in CELLS]
+        cells = [(cell(m[key], *ends[key], d=d) if math.isfinite(m[key]) else "  N/A").ljust(w) for key, d, w in CELLS]
         how = [row["failure"] for row in rows if row["failure"]]
         failures = ", ".join(f"{how.count(f)} {f}" for f in sorted(set(how))) or "none"
         print(f"{name:{width}} {len(rows):6d}  {''.join(cells)}{failures}")
