@@ -525,8 +525,6 @@ def draw_curve(ax, runs, colour, dashes, label):
     curves = np.array([np.pad(curve, (0, longest - len(curve)), constant_values=np.nan) for curve in curves])
     episode, mean = np.arange(1, longest + 1), np.nanmean(curves, axis=0)
     start = min(9, every // 2)  # the mean of one or two returns is noise that would set the scale of the axis
-    unfinished = sum(bool(run.unfinished) for run in runs)
-    label += f" ({len(runs)} seed{'s' * (len(runs) > 1)}{f', {unfinished} unfinished' if unfinished else ''})"
     ax.plot(episode[start:every], mean[start:every], color=colour, linestyle=dashes, linewidth=1.3, label=label)
     ax.plot(episode[every - 1:], mean[every - 1:], color=colour, linestyle=dashes, linewidth=0.6, alpha=0.7)
     if len(runs) > 1:
@@ -541,9 +539,12 @@ def draw_panel(ax, sweep, columns, runs, groups):
     for column in (column for column in columns if column["sweep"] in (sweep, "baseline", "other")):
         label = column_label(column, columns[0]["key"][0])
         colour = GREY if column["sweep"] == "baseline" else next(colours)
-        mine = by_group(runs, column)
-        for group, members in mine.items():
-            draw_curve(ax, members, colour, DASHES[groups.index(group) % len(DASHES)], label)
+        mine = sorted(by_group(runs, column).items(), key=lambda item: groups.index(item[0]))
+        seeds = " + ".join(str(len(members)) for _, members in mine)
+        unfinished = sum(bool(run.unfinished) for _, members in mine for run in members)
+        label += f" ({seeds} seed{'s' * (seeds != '1')}{f', {unfinished} unfinished' if unfinished else ''})"
+        for i, (group, members) in enumerate(mine):
+            draw_curve(ax, members, colour, DASHES[groups.index(group) % len(DASHES)], label if i == 0 else None)
         if mine and math.isfinite(column["R90"]):
             ax.axhline(column["R90"], color=colour, linestyle=":", linewidth=0.8, zorder=1)
 
@@ -574,7 +575,8 @@ def learning_figure(task, runs):
     lines.append(Line2D([], [], color="k", linestyle=":", linewidth=0.8, label=r"the paper's $\overline{R}_{90}$"))
     figure.legend(handles=lines, loc="outside lower center", ncols=2, title=(
         "mean over seeds and 95 % band (percentile bootstrap over seeds);\n"
-        "thin: mean of the seeds that go on after the shortest has ended"))
+        "thin: mean of the seeds that go on after the shortest has ended"
+        + ";\na + b seeds: of the lines below, in their order" * (len(groups) > 1)))
     return figure
 
 

@@ -369,6 +369,17 @@ def test_the_figure_draws_each_sweep_with_the_baseline_and_the_papers_R90(tmp_pa
     assert dotted == [[3.72, 0.9], [8.58, 0.9]]
 
 
+def test_a_column_of_two_groups_is_named_once_with_the_seeds_of_each_in_the_order_of_their_lines(tmp_path):
+    for i, symmetry in enumerate(("gas", "so2", "so2")):
+        write_run(tmp_path / f"runs/{i}", seed=i, symmetry=symmetry)
+    runs, _ = plot_curves.find_runs("p2p", None)
+    figure = plot_curves.learning_figure("p2p", runs)
+    assert [line.get_label() for line in figure.axes[0].lines if "seed" in line.get_label()] == [
+        r"$\lambda_{BC}=1.8$ (2 + 1 seeds)"]
+    first, second, _ = (text.get_text() for text in figure.legends[0].get_texts())
+    assert "so2" in first and "gas" in second
+
+
 def test_a_curve_is_the_mean_over_all_seeds_up_to_the_shortest_with_a_band(tmp_path):
     write_run(tmp_path / "runs/a", [1.0] * 100, seed=0)
     write_run(tmp_path / "runs/b", [3.0] * 150, seed=1)
