@@ -282,6 +282,19 @@ def test_the_stratified_bootstrap_draws_each_columns_seeds_among_themselves():
     assert (value, low, high) == (0.5, 0, 1)
 
 
+def test_the_comparison_agrees_with_rliables_own_figures():
+    """aggregate_iqm, probability_of_improvement and get_interval_estimates (reps=20000) of rliable 1.2.0, which needs
+    arch 7.2.0 and with it pandas 2.3.3: too much to install for a test. Bootstraps differ in their random numbers."""
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(5, 3)), rng.normal(0.3, 1, size=(5, 3))  # (seeds, columns)
+    value, low, high = plot_curves.stratified(lambda strata: plot_curves.iqm(np.concatenate(strata)), list(x.T))
+    assert value == pytest.approx(0.19013407785655542, rel=1e-12)
+    assert (low, high) == pytest.approx((-0.12367689, 0.43313092), abs=0.03)
+    value, low, high = plot_curves.stratified(plot_curves.improvement, list(x.T), list(y.T))
+    assert value == pytest.approx(0.5066666666666667, rel=1e-12)
+    assert (low, high) == pytest.approx((0.28, 0.73333333), abs=0.03)
+
+
 def test_groups_are_compared_below_the_training_table_where_they_have_two_seeds(tmp_path, capsys):
     for seed in (0, 1):
         write_run(tmp_path / f"runs/a{seed}", [8.0 + seed] * 60, seed=seed, success=(1, 1))
