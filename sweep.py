@@ -68,6 +68,14 @@ class Run:
             return []
         return [row for row in rows if row["seconds"] and row["eval_return"] is not None]  # whole lines only
 
+    def saved_last(self):
+        """Whether the checkpoint was saved after the last epoch was logged: for runs that were ended by hand."""
+        try:
+            saved, logged = (os.stat(self.folder / name).st_mtime_ns for name in ("checkpoint.pt", "progress.csv"))
+            return saved >= logged
+        except OSError:
+            return False
+
     def state(self):
         """(waiting | queued | running | stopped | failed | done, the last error line where it failed)."""
         try:
@@ -81,7 +89,7 @@ class Run:
             return "queued", ""
         lines = log_lines(self.folder)
         code = lines[-1].removeprefix(EXIT) if lines and lines[-1].startswith(EXIT) else ""
-        if code == "0" and self.steps() >= self.total:
+        if self.steps() >= self.total and (code == "0" or code in ("", str(STOPPED)) and self.saved_last()):
             return "done", ""
         if code not in ("", "0", str(STOPPED)):
             said = [line for line in lines[:-1] if line.strip() and not line.startswith(EXIT)]

@@ -213,6 +213,16 @@ def test_longer_sweep_goes_on_where_a_shorter_one_was_done(tmp_path, unbroken):
     assert curves(whole.folder) == unbroken[0]
 
 
+def test_run_that_was_made_by_hand_is_done_once_its_last_checkpoint_is_saved(tmp_path):
+    short = [*LONG[:4], "--epochs", 2, "--steps_per_epoch", 50, "--seeds", 1]
+    (only,) = runs_of(*short, data_dir=tmp_path)
+    subprocess.run(only.command, check=True)
+    assert not (only.folder / "log.txt").exists() and only.state() == ("done", "")
+    later = (only.folder / "checkpoint.pt").stat().st_mtime + 1
+    os.utime(only.folder / "progress.csv", (later, later))  # killed before the checkpoint was saved
+    assert only.state() == ("stopped", "")
+
+
 def test_cluster_without_submitit_or_without_slurm_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys):
     words = [*LONG, "--seeds", "1", "--cluster", "slurm", "--data_dir", str(tmp_path)]
     monkeypatch.setattr(sweep, "measured_rate", lambda run: 100.0)
