@@ -146,8 +146,10 @@ def load_torch(path):
             return torch.load(path, weights_only=True, map_location="cpu")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
-    except Exception as error:  # garbled bytes end in an exception of any kind
-        raise ValueError(f"{path}: not a whole file of tensors ({one_line(error)})") from None
+    except (PermissionError, IsADirectoryError) as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except Exception:  # garbled bytes end in an exception of any kind
+        raise ValueError(f"{path}: cut short, or holds more than tensors and plain types (and is not loaded)") from None
 
 
 def one_line(error):

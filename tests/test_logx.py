@@ -207,7 +207,7 @@ def test_load_torch_refuses_with_a_line_that_names_the_file(tmp_path, what):
     path.write_bytes(unloadable()[what])
     with pytest.raises(ValueError) as refused:
         logx.load_torch(path)
-    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(f"{path}: cut short, or holds more than tensors")
 
 
 @pytest.mark.filterwarnings("error")
@@ -223,7 +223,7 @@ def test_load_torch_refuses_any_text_and_any_bytes(tmp_path):
 def test_load_torch_says_when_there_is_no_file_and_when_it_is_a_folder(tmp_path):
     with pytest.raises(ValueError, match=f"{tmp_path}/missing.pt: no such file"):
         logx.load_torch(tmp_path / "missing.pt")
-    with pytest.raises(ValueError, match=str(tmp_path)):
+    with pytest.raises(ValueError, match=f"{tmp_path}: Is a directory"):
         logx.load_torch(tmp_path)
 
 
