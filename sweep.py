@@ -89,11 +89,11 @@ class Run:
             return "queued", ""
         lines = log_lines(self.folder)
         code = lines[-1].removeprefix(EXIT) if lines and lines[-1].startswith(EXIT) else ""
-        if self.steps() >= self.total and (code == "0" or code in ("", str(STOPPED)) and self.saved_last()):
-            return "done", ""
         if code not in ("", "0", str(STOPPED)):
             said = [line for line in lines[:-1] if line.strip() and not line.startswith(EXIT)]
             return "failed", f"exit code {code}: {said[-1] if said else 'it said nothing'}"
+        if self.steps() >= self.total and (code == "0" or self.saved_last()):
+            return "done", ""
         return ("stopped" if self.steps() else "waiting"), ""
 
 
