@@ -188,91 +188,84 @@ def mlp(sizes, layernorm=False):
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 
-class _Forward(torch.autograd.Function):
-    """An mlp() as one node of the graph: for nets this small, a node a layer costs as much as the matrix products.
+class Passes:
+    """Both passes through an mlp(), written out: for nets this small, autograd and modules cost as much as the matrix
+    products. Its weights and gradients become views of the vectors flat and grad; matrices lie as (n_in, n_out)."""
 
-    Of the rows of x, the first `train` give gradients to the weights (written into their place in ActorCritic.grad),
-    the first `alive` may carry a gradient at all, and those from `train` on pass theirs on to x.
-    """
+    def __init__(self, module, flat, grad):
+        self.layers, i = [], 0  # of each W, b, W_grad, b_grad, and where a LayerNorm follows, the same four of it
+        for layer in module:
+            weights, gradients = [], []
+            for p in layer.parameters():
+                part = slice(i, i := i + p.numel())
+                w, g = (vector[part].view(p.t().shape) for vector in (flat, grad))
+                p.data, p.grad = w.copy_(p.detach().t()).t(), g.t()
+                weights.append(w)
+                gradients.append(g)
+            if isinstance(layer, nn.Linear):
+                self.layers.append([])
+            self.layers[-1] += weights + gradients
 
-    @staticmethod
-    def forward(ctx, x, weights, layers, train, alive):
-        saved = []
-        for kind, *w in layers:
-            saved.append((x[:alive],))
-            if kind is nn.Linear:
-                x = torch.addmm(w[1], x, w[0].t())
-            elif kind is nn.LayerNorm:
-                x, mean, rstd = torch.native_layer_norm(x, w[1].shape, w[0], w[1], 1e-5)
-                saved[-1] += (mean[:alive], rstd[:alive])
-            else:
-                x = x.relu_()
-        ctx.saved, ctx.layers, ctx.train, ctx.alive, ctx.rows = saved, layers, train, alive, len(x)
-        return x
+    def forward(self, x):
+        """x (n, n_in) to (n, n_out), and what `backward` needs to know of the way."""
+        tape = []
+        for W, b, _, _, *norm in self.layers:
+            tape.append([x])
+            x = torch.addmm(b, x, W)
+            if norm:
+                tape[-1].append(x)
+                x, mean, rstd = torch.native_layer_norm(x, b.shape, norm[0], norm[1], 1e-5)
+                tape[-1] += [mean, rstd]
+            if len(tape) < len(self.layers):
+                x.relu_()
+        return x, tape
 
-    @staticmethod
-    def backward(ctx, g):
-        n, g = ctx.train, g[: ctx.alive]
-        for i in reversed(range(len(ctx.layers))):
-            (kind, *w), (x, *statistics) = ctx.layers[i], ctx.saved[i]
-            if kind is nn.Linear:
-                torch.mm(g[:n].t(), x[:n], out=w[2])
-                torch.sum(g[:n], 0, out=w[3])
-                if i:
-                    g = torch.mm(g, w[0])
-            elif kind is nn.LayerNorm:
-                dw = torch.ops.aten.native_layer_norm_backward(
-                    g, x, w[1].shape, *statistics, w[0], w[1], (True, False, False)
-                )[0]
-                normal = (x[:n] - statistics[0][:n]).mul_(statistics[1][:n])
-                torch.sum(normal.mul_(g[:n]), 0, out=w[2])
-                torch.sum(g[:n], 0, out=w[3])
-                g = dw
-            else:
-                g = torch.ops.aten.threshold_backward(g, x, 0)  # x is what relu_ left there
-        if not ctx.needs_input_grad[0]:
-            return None, None, None, None, None
-        g_x = g.new_zeros(ctx.rows, ctx.saved[0][0].shape[1])
-        torch.mm(g[n:], ctx.layers[0][1], out=g_x[n : ctx.alive])
-        return g_x, None, None, None, None
+    def backward(self, g, tape, first=0):
+        """From the loss's gradient g (m, n_out) by the first m rows of the output: the weights', by rows `first` to m
+        alone, into their places, and that by the rows of x before `first`, which is returned (first, n_in)."""
+        m, y = len(g), None  # y: the layer's output
+        for (W, b, W_grad, b_grad, *norm), (x, *before_norm) in zip(reversed(self.layers), reversed(tape), strict=True):
+            if y is not None:
+                torch.ops.aten.threshold_backward.grad_input(g, y[:m], 0, grad_input=g)  # relu
+            if norm:
+                z, mean, rstd = (t[:m] for t in before_norm)
+                z_hat = (z[first:] - mean[first:]).mul_(rstd[first:])
+                torch.sum(z_hat.mul_(g[first:]), 0, out=norm[2])
+                torch.sum(g[first:], 0, out=norm[3])
+                g, *_ = torch.ops.aten.native_layer_norm_backward(
+                    g, z, b.shape, mean, rstd, norm[0], norm[1], (True, False, False)
+                )
+            torch.mm(x[first:m].t(), g[first:], out=W_grad)
+            torch.sum(g[first:], 0, out=b_grad)
+            if x is tape[0][0]:
+                return torch.mm(g[:first], W.t())
+            g, y = torch.mm(g, W.t()), x
 
 
-class ActorCritic(nn.Module):
+class ActorCritic:
     """pi_mu: s -> a = tanh(u) in [-1, 1]^4, and Q_nu: (s, a) -> R. All weights, and all gradients, lie in one vector
-    each (`flat`, `grad`; `mu` and `nu` are its two parts), so that optimiser and target update are one operation."""
+    each (`flat`, `grad`; `parts` are mu's and nu's), so that optimiser and target update are one operation."""
 
     def __init__(self, obs_dim, hidden_sizes, critic_layernorm, device):
-        super().__init__()
         self.u = mlp([obs_dim, *hidden_sizes, 4])  # pre-tanh
         self.q = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
-        self.flat = torch.cat([p.detach().flatten() for p in self.parameters()]).to(device)
-        self.grad = torch.zeros_like(self.flat)
-        i, self.layers = 0, {}
-        for net in (self.u, self.q):
-            self.layers[net] = []
-            for layer in net:
-                self.layers[net].append([type(layer)])
-                for p in layer.parameters():
-                    part = slice(i, i := i + p.numel())
-                    p.data, p.grad = self.flat[part].view_as(p), self.grad[part].view_as(p)
-            for p_layer, layer in zip(self.layers[net], net, strict=True):
-                p_layer += [p.data for p in layer.parameters()] + [p.grad for p in layer.parameters()]
-        n = sum(p.numel() for p in self.u.parameters())
-        self.mu, self.nu = nn.Parameter(self.flat[:n]), nn.Parameter(self.flat[n:])
-        self.mu.grad, self.nu.grad = self.grad[:n], self.grad[n:]
+        n_mu, n_nu = (sum(p.numel() for p in net.parameters()) for net in (self.u, self.q))
+        self.flat, self.grad = torch.zeros(2, n_mu + n_nu, device=device)
+        self.parts = slice(0, n_mu), slice(n_mu, None)
+        self.mu, self.nu = (
+            Passes(net.to(device), self.flat[part], self.grad[part])
+            for net, part in zip((self.u, self.q), self.parts, strict=True)
+        )
 
-    def pre_tanh(self, s):
-        """u of s (n, obs_dim): (n, 4)."""
-        return _Forward.apply(s, self.mu, self.layers[self.u], len(s), len(s))
-
+    @torch.no_grad()
     def pi(self, s):
         """pi_mu(s) of s (n, obs_dim): (n, 4)."""
-        return torch.tanh(self.pre_tanh(s))
+        return self.mu.forward(s)[0].tanh_()
 
-    def Q(self, s, a, train=0, alive=0):
-        """Q_nu of (n, obs_dim) and (n, 4). In a backward pass the first `train` rows reach the critic's weights, rows
-        train to alive reach the actions, and the rest nothing."""
-        return _Forward.apply(torch.cat((s, a), dim=1), self.nu, self.layers[self.q], train, alive).squeeze(1)
+    @torch.no_grad()
+    def Q(self, s, a):
+        """Q_nu of (n, obs_dim) and (n, 4): (n,)."""
+        return self.nu.forward(torch.cat((s, a), dim=1))[0].squeeze(1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -322,8 +315,11 @@ class Learner:
         sizes = (obs_dim, flags.hidden_sizes, flags.critic_layernorm, flags.device)
         self.net, self.target = ActorCritic(*sizes), ActorCritic(*sizes)
         self.target.flat.copy_(self.net.flat)
-        groups = [dict(params=[self.net.mu], lr=flags.pi_lr), dict(params=[self.net.nu], lr=flags.q_lr)]
-        self.optimizer = torch.optim.Adam(groups, fused=True)
+        self.moments = torch.zeros(2, *self.net.flat.shape, device=flags.device)  # Adam's
+        self.steps = torch.zeros((), device=flags.device)
+        vectors = (self.net.flat, self.net.grad, *self.moments)
+        self.adam = [[[x[part]] for x in vectors] + [[], [self.steps]] for part in self.net.parts]
+        self.lr = (flags.pi_lr, flags.q_lr)
         self.actor = self.net.u if flags.device == "cpu" else deepcopy(self.net.u).cpu()  # what acts
         self.return_range = (-4.0, TASKS[flags.task].return_max)
         self.conservative = flags.conservative
@@ -336,8 +332,7 @@ class Learner:
         f = self.flags
         self.conservative = f.conservative * max(0.0, 4 * left - 3)
         if f.lr_decay:
-            for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-                group["lr"] = lr * min(1.0, 2 * left)
+            self.lr = tuple(lr * min(1.0, 2 * left) for lr in (f.pi_lr, f.q_lr))
         rows, rows_demo = B_o.sample(f.batch_size, n), B_d.sample(f.demo_batch_size, n) if B_d else None
         if f.symmetry == "so2":  # each transition turned by an angle of its own
             rows = turn(rows, self.widths)
@@ -353,68 +348,75 @@ class Learner:
                     p.copy_(q)
         return dict(zip(measured, torch.stack(list(measured.values())).tolist(), strict=True))
 
+    @torch.inference_mode()
     def update(self, rows, rows_demo, measure=False):
         """One gradient step of ag:d-ease-off on a batch of B_o and one of B_d (or None). measure: returns tensors."""
         f = self.flags
-        s, a, r, s2, zeta = rows.split(self.widths, dim=-1)
-        s_demo, a_demo = (s[:0], a[:0]) if rows_demo is None else rows_demo.split(self.widths, dim=-1)[:2]
-        n, n_demo = len(s), len(s_demo)
+        rows_demo = rows[:0] if rows_demo is None else rows_demo
+        (s, a, r, s2, zeta), (s_demo, a_demo, *_) = (x.split(self.widths, dim=1) for x in (rows, rows_demo))
+        n, n_demo = len(rows), len(rows_demo)
 
-        with torch.no_grad():
-            y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
-            if f.clip_target:
-                y = y.clamp(*self.return_range)
-        u = self.net.pre_tanh(torch.cat((s, s_demo)))
-        a_pi, a_hat = torch.tanh(u).split((n, n_demo))
-        # One pass of the critic: first the rows that reach its weights (L_C), then those that reach the actor (L_O),
-        # then those of the mask alone.
-        rows_Q = {"s_a": (s, a), "s_pi": (s, a_pi), "own": (s_demo, a_hat.detach()), "demo": (s_demo, a_demo)}
-        train = n
-        if self.conservative:
-            rows_Q["s_pi"], train = rows_Q.pop("s_pi"), n + 2 * n_demo
-        Q = self.net.Q(*(torch.cat(x) for x in zip(*rows_Q.values(), strict=True)), train, train + n)
-        Q = dict(zip(rows_Q, Q.split([len(x) for x, _ in rows_Q.values()]), strict=True))
-        L_C = loss_C(Q["s_a"], y)
+        y = r.squeeze(1) + f.gamma * (1 - zeta.squeeze(1)) * self.target.Q(s2, self.target.pi(s2))
+        if f.clip_target:
+            y = y.clamp(*self.return_range)
+        u, tape_mu = self.net.mu.forward(torch.cat((s, s_demo)))
+        a_pi, a_hat = (a_all := torch.tanh(u)).split((n, n_demo))
+        # one pass of the critic, over (s, pi(s)), (s, a), (s_demo, pi(s_demo)), (s_demo, a_demo)
+        x, x_demo = (x[:, : sum(self.widths[:2])] for x in (rows, rows_demo))
+        x = torch.cat((x, x, x_demo, x_demo))
+        x[:n, -4:], x[2 * n : 2 * n + n_demo, -4:] = a_pi, a_hat
+        Q, tape_nu = self.net.nu.forward(x)
+        Q_pi, Q_s_a, Q_own, Q_demo = Q.squeeze(1).split((n, n, n_demo, n_demo))
+        M = mask(Q_demo, Q_own)
+
+        # the gradient of L_C by Q(s, a) and of L_O by Q(s, pi(s)), then of L_O and lambda L_BC by the actions and by u
+        scale = Q_pi.mean().abs().clamp(min=1e-3) if f.normalize_q else 1.0
+        g_Q = [torch.full_like(Q_pi, -1 / n).div_(scale), (Q_s_a - y) * (2 / n)]
         if self.conservative and n_demo:
-            L_C = L_C + self.conservative * loss_conservative(Q["demo"], Q["own"])
-        L_O = L_A = loss_O(Q["s_pi"], f.normalize_q)
-        L_BC = M = L_O.new_full((), math.nan)
-        if n_demo:
-            M = mask(Q["demo"], Q["own"])
-            L_BC = loss_BC(a_demo, a_hat, M)
-            L_A = loss_A(L_O, L_BC, f.lambda_bc)
+            too_good = (Q_own >= Q_demo) * (self.conservative / n_demo)
+            g_Q += [too_good, -too_good]
+        g_pi = self.net.nu.backward(torch.cat(g_Q).unsqueeze(1), tape_nu, first=n)[:, -4:]
+        g_hat = (a_hat - a_demo) * (M * (f.lambda_bc / (2 * max(1, n_demo)))).unsqueeze(1)
+        self.net.mu.backward(torch.cat((g_pi, g_hat)) * (1 - a_all * a_all), tape_mu)
 
-        (L_C + L_A).backward()
-        self.optimizer.step()
-        with torch.no_grad():  # mu' <- omega mu' + (1 - omega) mu, nu' alike
-            self.target.flat.lerp_(self.net.flat, 1 - f.polyak)
-            if not measure:
-                return None
-            return {
-                "L_O": L_O.detach(),
-                "L_BC": L_BC.detach(),
-                "L_C": L_C.detach(),
-                "L_A": L_A.detach(),
-                "mask_fraction": M.mean(),
-                "Q_mean": Q["s_a"].mean(),
-                "Q_max": Q["s_a"].max(),
-                "pretanh_own": u[:n].abs().mean(),
-                "pretanh_demo": u[n:].abs().mean(),
-                # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
-                "bc_relative_error": ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
-            }
+        self.steps += 1
+        for tensors, lr in zip(self.adam, self.lr, strict=True):  # torch.optim.Adam(fused=True), without its overhead
+            torch._fused_adam_(*tensors, lr=lr, beta1=0.9, beta2=0.999, weight_decay=0, eps=1e-8, amsgrad=False,
+                               maximize=False)  # fmt: skip
+        self.target.flat.lerp_(self.net.flat, 1 - f.polyak)  # mu' <- omega mu' + (1 - omega) mu, nu' alike
+        if not measure:
+            return None
+        L_C, L_O = loss_C(Q_s_a, y), loss_O(Q_pi, f.normalize_q)
+        L_BC = loss_BC(a_demo, a_hat, M)
+        if self.conservative and n_demo:
+            L_C = L_C + self.conservative * loss_conservative(Q_demo, Q_own)
+        return {
+            "L_O": L_O,
+            "L_BC": L_BC,
+            "L_C": L_C,
+            "L_A": loss_A(L_O, L_BC, f.lambda_bc) if n_demo else L_O,
+            "mask_fraction": M.mean(),
+            "Q_mean": Q_s_a.mean(),
+            "Q_max": Q_s_a.max(),
+            "pretanh_own": u[:n].abs().mean(),
+            "pretanh_demo": u[n:].abs().mean(),
+            # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
+            "bc_relative_error": ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
+        }
 
     def state(self):
         return {
             "net": self.net.flat.cpu().clone(),
             "target": self.target.flat.cpu().clone(),
-            "optimizer": self.optimizer.state_dict(),
+            "moments": self.moments.cpu().clone(),
+            "steps": self.steps.item(),
         }
 
     def load(self, state):
         self.net.flat.copy_(state["net"])
         self.target.flat.copy_(state["target"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.moments.copy_(state["moments"])
+        self.steps.fill_(state["steps"])
         self.actor.load_state_dict(self.net.u.state_dict())
 
     def policy(self):

@@ -169,7 +169,7 @@ def is_new(folder, resume):
         fail(f"--name {folder.name}: {folder} cannot be read ({error.strerror})")
 
 
-FORMAT = 1  # of a checkpoint: raised where older ones cannot go on
+FORMAT = 2  # of a checkpoint: raised where older ones cannot go on
 
 
 class Run:
