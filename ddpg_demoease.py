@@ -33,7 +33,7 @@ import evaluate
 import gas
 import logx
 import pid_demo
-from kinova_env import TASKS
+from kinova_env import OBSERVATION, TASKS
 from logx import flag
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
@@ -446,16 +446,19 @@ def train(flags, variant=""):
         if demos and len(demos["rew"]) > flags.replay_size:
             n = len(demos["rew"])
             logx.fail(f"--replay_size {flags.replay_size}: holds less than the {n} demonstrated steps")
-    run = logx.Run(folder, config, flags.tensorboard)
     torch.manual_seed(flags.seed)
+    obs_dim = sum(width for _, width, _ in OBSERVATION[flags.task])
+    try:
+        learner = Learner(flags, obs_dim)
+        B_o, B_d = ReplayBuffer(obs_dim, flags.replay_size, flags.n_step, flags.gamma), None
+    except (RuntimeError, MemoryError):
+        logx.fail(f"--hidden_sizes {flags.hidden_sizes} and --replay_size {flags.replay_size}: do not fit in memory")
+    run = logx.Run(folder, config, flags.tensorboard)
     rng = np.random.default_rng(flags.seed)  # exploration
     make = dict(max_episode_steps=flags.max_ep_len, disable_env_checker=True)
     env = gymnasium.make(TASKS[flags.task].env_id, stage="train", **make)
     eval_env = gymnasium.make(TASKS[flags.task].env_id, stage="test", **make)
-    obs_dim = env.observation_space.shape[0]
     view = gas.canonical if flags.symmetry == "canonical" else lambda obs: obs
-    learner = Learner(flags, obs_dim)
-    B_o, B_d = ReplayBuffer(obs_dim, flags.replay_size, flags.n_step, flags.gamma), None
     total_steps = flags.epochs * flags.steps_per_epoch
 
     if run.checkpoint:
@@ -612,7 +615,8 @@ def main():
     flags, variant = complete(logx.parse_flags(Flags, __doc__))
     folder = train(flags, variant)
     if flags.quick:
-        agents = {str(folder): folder, f"PID, {flags.gains} gains": flags.gains}
+        gains = flags.gains or "fast"
+        agents = {str(folder): folder, f"PID, {gains} gains": gains}
         found = {name: evaluate.run_trials(flags.task, agent, 100, quiet=flags.quiet) for name, agent in agents.items()}
         evaluate.write(folder, *found[str(folder)])
         evaluate.print_table({name: rows for name, (rows, _) in found.items()})

@@ -81,9 +81,10 @@ def load_policy(run_folder):
 
 
 def trial(env, act, i):
-    """Runs test trial i to its end. Returns its row of evaluation.csv (dict), ||e_t|| in m (length + 1,), and the TCP's
-    path in m (length + 1, 3)."""
+    """Runs test trial i to its end. Returns its row of evaluation.csv (dict), ||e_t|| in m (length + 1,), the path of
+    the TCP in m (length + 1, 3), and where the goal and (NaN on P2P) the cube were at its start, in m (2, 3)."""
     s, info = env.reset(seed=FIRST_SEED + i)
+    start = [tuple(env.unwrapped.goal), tuple(getattr(env.unwrapped, "cube", (math.nan,) * 3))]
     errors, path, total, effort, done = [info["distance"]], [env.unwrapped.tcp], 0.0, 0.0, False
     while not done:
         s, r, terminated, truncated, info = env.step(act(s))
@@ -108,7 +109,7 @@ def trial(env, act, i):
         "goal_rho": math.hypot(x, y),
         "goal_z": z,
     }
-    return row, np.array(errors, dtype=np.float32), np.array(path, dtype=np.float32)
+    return row, np.array(errors, dtype=np.float32), np.array(path, dtype=np.float32), np.array(start)
 
 
 def make_agent(task, source, **render):
@@ -126,9 +127,7 @@ def _trials(job):
     env, act = make_agent(task, source)
     done = []
     for i in numbers:
-        row, errors, path = trial(env, act, i)
-        cube = getattr(env.unwrapped, "cube", (math.nan,) * 3)  # P2P has none
-        done.append((row, errors, (path, env.unwrapped.goal, cube)))
+        done.append(trial(env, act, i))
     env.close()
     return done
 
@@ -136,7 +135,7 @@ def _trials(job):
 def run_trials(task, source, trials=500, jobs=1, quiet=False):
     """Test trials 0 ... trials-1. source: a run folder (Path) or PID gains. Returns the rows of evaluation.csv and the
     arrays of trajectories.npz: `length`, `success` (trials,), `error` in m, every trial's length + 1 values one after
-    another, and of the first PATHS trials `tcp` in m, alike, `goal` and `object` as the trial ended (n, 3)."""
+    another, and of the first PATHS trials `tcp` in m, alike, `goal` and `object` as the trial began (n, 3)."""
     chunks = [(task, source, list(range(i, min(i + 10, trials)))) for i in range(0, trials, 10)]
     bar = dict(total=len(chunks), desc="trials / 10", disable=quiet or None, leave=False)
     if jobs == 1:
@@ -144,11 +143,11 @@ def run_trials(task, source, trials=500, jobs=1, quiet=False):
     else:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             parts = list(tqdm(pool.map(_trials, chunks), **bar))
-    rows, errors, paths = zip(*(done for part in parts for done in part), strict=True)
-    tcp, goal, cube = zip(*paths[:PATHS], strict=True)
+    rows, errors, tcp, starts = zip(*(done for part in parts for done in part), strict=True)
+    goal, cube = np.array(starts[:PATHS]).swapaxes(0, 1)
     trajectories = {"length": np.array([row["length"] for row in rows]), "error": np.concatenate(errors)}
-    trajectories |= {"success": np.array([row["success"] for row in rows], dtype=bool), "tcp": np.concatenate(tcp)}
-    return list(rows), trajectories | {"goal": np.array(goal), "object": np.array(cube)}
+    trajectories |= {"success": np.array([row["success"] for row in rows], dtype=bool)}
+    return list(rows), trajectories | {"tcp": np.concatenate(tcp[:PATHS]), "goal": goal, "object": cube}
 
 
 def metrics(rows):
@@ -273,19 +272,21 @@ def main():
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
     parser.add_argument("--pid", action="store_true", help="the PID demonstrator too")
     parser.add_argument("--task", choices=TASKS, help="with --pid")
-    parser.add_argument("--gains", choices=pid_demo.GAINS, default="authors", help="with --pid")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="with --pid: where its trials are written")
+    parser.add_argument("--gains", choices=pid_demo.GAINS, help="with --pid (authors)")
+    parser.add_argument("--out", type=logx.path, metavar="FOLDER", help="with --pid: where its trials are written")
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     parser.add_argument("--versus", type=Path, metavar="RUN", help="print paired differences from this run as well")
-    parser.add_argument("--gif", metavar="FILE", help="film trials instead, the agents side by side")
-    parser.add_argument("--mp4", metavar="FILE", help="the same as a video (pip install imageio imageio-ffmpeg)")
+    parser.add_argument("--gif", type=logx.path, metavar="FILE", help="film trials instead, the agents side by side")
+    parser.add_argument("--mp4", type=logx.path, metavar="FILE",
+                        help="the same as a video (pip install imageio imageio-ffmpeg)")  # fmt: skip
     parser.add_argument("--watch", action="store_true", help="trials in PyBullet's window instead")
-    parser.add_argument("--show", type=int, nargs="+", default=[*range(6)], metavar="I", help="which trials (0 ... 5)")
+    parser.add_argument("--show", type=int, nargs="+", metavar="I", help="which trials (0 ... 5; --watch: 0 1 2)")
     flags = parser.parse_args()
     for name in ("trials", "jobs"):
         if getattr(flags, name) < 1:
             parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
+    flags.show = flags.show or [*range(3 if flags.watch else 6)]
     if min(flags.show) < 0:
         parser.error(f"--show {min(flags.show)}: must be at least 0")
     if not (flags.pid or flags.runs):
@@ -294,11 +295,14 @@ def main():
         parser.error(f"--pid: needs --task, one of {', '.join(TASKS)}")
     if flags.out and not flags.pid:
         parser.error(f"--out {flags.out}: goes with --pid; a run's trials are written into its own folder")
+    for name in ("task", "gains"):
+        if getattr(flags, name) and not flags.pid:
+            parser.error(f"--{name} {getattr(flags, name)}: goes with --pid; a run says its own")
+    flags.gains = flags.gains or "authors"
     film = flags.gif or flags.mp4
     for name in ("gif", "mp4"):
-        path = getattr(flags, name)
-        if path and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
-            parser.error(f"--{name} {path}: is a folder, or its folder does not exist")
+        if getattr(flags, name):
+            pid_demo.check_output(parser, name, getattr(flags, name), f".{name}")
     if flags.mp4 and not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg"))):
         parser.error("--mp4: needs imageio and imageio-ffmpeg (pip install imageio imageio-ffmpeg), or use --gif")
     if bool(flags.gif) + bool(flags.mp4) + flags.watch > 1:
@@ -318,9 +322,11 @@ def main():
         parser.error(f"--versus, --gif, --mp4: the agents must be of one task, not {' and '.join(tasks)}")
     if film or flags.watch:
         try:
-            show(agents, flags.show[:3] if flags.watch else flags.show, film)
+            show(agents, flags.show, film)
         except ValueError as error:
             parser.error(str(error))
+        except OSError as error:
+            parser.error(f"{film}: cannot be written ({error.strerror or error})")
         if film:
             print(f"wrote {film}")
         return
@@ -328,7 +334,9 @@ def main():
     for name, (task, source) in agents.items():
         results[name], trajectories = run_trials(task, source, flags.trials, flags.jobs)
         try:
-            if isinstance(source, Path):
+            if isinstance(source, Path) and (source / "evaluation.csv.gz").exists():
+                print(f"{name}: a published run, its files stay as they are")
+            elif isinstance(source, Path):
                 write(source, results[name], trajectories)
             elif flags.out:
                 flags.out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
 """A run's folder: what was asked (config.json), its curves (episodes.csv, progress.csv) and its checkpoint.
 
     flags = logx.parse_flags(Flags, __doc__)          # a dataclass of typed flags, as a command line
-    run = logx.Run(folder, config, resume=flags.resume)
-    run.write("episodes", {...}); run.write("progress", {...}); run.save({...})
+    run = logx.Run(folder, config)                    # goes on from run.checkpoint, where it is not None
+    run.write("episodes", {...}); run.write("progress", {...}); run.save(state, config, policy)
 
 What is on disk is always whole: files are written beside their place, fsynced and renamed, and on a resume the curves
 are cut back to the checkpoint they belong to, so that a killed and resumed run equals one that was never killed.
@@ -26,8 +26,6 @@ import warnings
 import zlib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-import torch
 
 EPISODES = ["episode", "env_steps", "return", "length", "success", "collision"]
 PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success", "L_O", "L_BC", "L_C", "L_A"]
@@ -64,6 +62,13 @@ def parse_flags(cls, doc, argv=None):
     return cls(**vars(parser.parse_args(argv)))
 
 
+def path(text):
+    """The type of a flag that names a file or folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("must name a file or folder")
+    return Path(text)
+
+
 def flag(default, help=None, choices=None, low=None, high=None):
     """A dataclass field that is a command-line flag; low and high are the smallest and largest allowed values."""
     return dataclasses.field(default=default, metadata=dict(help=help, choices=choices, low=low, high=high))
@@ -95,6 +100,10 @@ def name_run(flags, printed, algo):
     Exits with 2 where the name is no folder's or the device is not here."""
     asked = dataclasses.asdict(flags).items()
     changed = {key: value for key, value in asked if key not in NOT_A_VARIANT and value != getattr(printed, key)}
+    if flags.demos is not None:  # what they were recorded with is said by the file, not by these flags
+        flags.gains = flags.demo_noise = None
+        changed = {key: value for key, value in changed.items() if key not in ("gains", "demo_noise")}
+        changed["demos"] = Path(flags.demos).name
     variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
     if len(variant) > 80:
         variant = f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
@@ -103,8 +112,13 @@ def name_run(flags, printed, algo):
         flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
     if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
         fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
-    if flags.device == "cuda" and not torch.cuda.is_available():
-        fail("--device cuda: torch sees no GPU here; use --device cpu")
+    if not flags.data_dir:
+        fail("--data_dir '': must be a folder; . is the present one")
+    if flags.device == "cuda":
+        import torch
+
+        if not torch.cuda.is_available():
+            fail("--device cuda: torch sees no GPU here; use --device cpu")
     return variant
 
 
@@ -140,6 +154,8 @@ def versions():
 
 def load_torch(path):
     """torch.load of tensors and plain types only. Raises ValueError with what is wrong with the file."""
+    import torch  # here and below: seconds, which scripts that do not learn are spared
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -199,17 +215,17 @@ class Run:
             except ValueError as error:
                 fail(f"--resume: {error}")
         self._files = {}
-        for name, columns in (("episodes", EPISODES), ("progress", PROGRESS)):
-            path = self.folder / f"{name}.csv"
-            if self.checkpoint:
-                size = self.checkpoint["log_bytes"][name]
-                if not path.exists() or path.stat().st_size < size:
-                    fail(f"--resume: {path} is gone or shorter than its checkpoint says ({size} bytes)")
-                os.truncate(path, size)  # rows after the checkpoint are made again
-            else:
-                path.write_text(",".join(columns) + "\n")
-            self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
         with self._whole():
+            for name, columns in (("episodes", EPISODES), ("progress", PROGRESS)):
+                path = self.folder / f"{name}.csv"
+                if self.checkpoint:
+                    size = self.checkpoint["log_bytes"][name]
+                    if not path.exists() or path.stat().st_size < size:
+                        fail(f"--resume: {path} is gone or shorter than its checkpoint says ({size} bytes)")
+                    os.truncate(path, size)  # rows after the checkpoint are made again
+                else:
+                    path.write_text(",".join(columns) + "\n")
+                self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
             self._write_config(config)
         self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
         self._begin = time.monotonic()
@@ -231,7 +247,7 @@ class Run:
         path, made_with = self.folder / "config.json", versions()
         text = config | {"command": sys.argv, "versions": made_with}
         if self.checkpoint:
-            before = json.loads(path.read_text())
+            before = self._config
             text = (text if config["epochs"] > before["epochs"] else before) | {"versions": before["versions"]}
             resumed = before.get("resumed_with", [])
             if made_with != [before["versions"], *resumed][-1]:
@@ -242,14 +258,22 @@ class Run:
         """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
         free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
                 "eval_trials", "device"}  # fmt: skip
-        if self.checkpoint.get("format", 1) != FORMAT:
-            raise ValueError(f"{self.folder / 'checkpoint.pt'}: of another version of this code; begin a new --name")
-        before = json.loads(self.checkpoint["config"])
+        path, parts = self.folder / "checkpoint.pt", {"config", "log_bytes", "seconds"}
+        made_with = self.checkpoint if isinstance(self.checkpoint, dict) else {}
+        if made_with.get("format", 1) != FORMAT or not parts <= set(made_with):
+            raise ValueError(f"{path}: of another version of this code; begin a new --name")
+        before = json.loads(made_with["config"])
+        if before.get("algo") != config.get("algo"):
+            raise ValueError(f"{path}: a run of {before.get('algo')}, not of {config.get('algo')}")
         for key in sorted(set(config) | set(before)):
             if key not in free and json.dumps(config.get(key)) != json.dumps(before.get(key)):
-                raise ValueError(
-                    f"{self.folder / 'checkpoint.pt'}: made with --{key} {before.get(key)}, not {config.get(key)}"
-                )
+                raise ValueError(f"{path}: made with --{key} {before.get(key)}, not {config.get(key)}")
+        path = self.folder / "config.json"
+        try:
+            self._config = json.loads(path.read_text())
+            self._config["versions"], self._config["epochs"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: a run's settings as JSON are expected ({one_line(error)})") from None
 
     def seconds(self):
         """Wall-clock seconds of the run, earlier parts included."""
@@ -271,6 +295,8 @@ class Run:
     def save(self, state, config, policy):
         """Writes checkpoint.pt, `state` (tensors and plain types) and what a resume needs of the folder itself, and
         policy.pt."""
+        import torch
+
         with self._whole():
             sizes = {}
             for name, file in self._files.items():

@@ -23,6 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
+import logx
 from kinova_env import EPSILON, OBSERVATION, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 
 CLEARANCE = {"obstacle": 0.18, "object": 0.15}  # m, of the way above the cube on P2P-O, before it (at most) on P&P
@@ -246,17 +247,28 @@ def film(agents, path, seeds, every=4):
     from PIL import Image
 
     temporary, fps = Path(path).with_name(f".part-{Path(path).name}"), 1 / (TIME_STEP * every)
-    if str(path).endswith(".mp4"):
-        import imageio
+    try:
+        if str(path).endswith(".mp4"):
+            import imageio
 
-        with imageio.get_writer(temporary, fps=fps, macro_block_size=None) as video:
-            for picture in frames(agents, seeds, every):
-                video.append_data(picture)
-    else:
-        images = [Image.fromarray(picture).quantize(64) for picture in frames(agents, seeds, every)]
-        of_gif = dict(save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
-        images[0].save(temporary, "GIF", **of_gif)
-    os.replace(temporary, path)
+            with imageio.get_writer(temporary, fps=fps, macro_block_size=None) as video:
+                for picture in frames(agents, seeds, every):
+                    video.append_data(picture)
+        else:
+            images = [Image.fromarray(picture).quantize(64) for picture in frames(agents, seeds, every)]
+            of_gif = dict(save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+            images[0].save(temporary, "GIF", **of_gif)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_output(parser, name, path, suffix=""):
+    """Ends with 2 where the flag `name`'s path cannot become a file, or does not end in the suffix."""
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        parser.error(f"--{name} {path}: is a folder, or its folder does not exist")
+    if not path.name.endswith(suffix):
+        parser.error(f"--{name} {path}: its name must end in {suffix}")
 
 
 def main():
@@ -268,8 +280,8 @@ def main():
     job.add_argument("--record", type=int, metavar="N", help="record N episodes into --out")
     job.add_argument("--trials", type=int, metavar="N", help="run N episodes and print the mean success, length, ...")
     job.add_argument("--watch", action="store_true", help="three episodes in PyBullet's window")
-    job.add_argument("--gif", metavar="FILE", help="three episodes into a GIF")
-    parser.add_argument("--out", metavar="FILE", help="the .npz of --record")
+    job.add_argument("--gif", type=logx.path, metavar="FILE", help="three episodes into a GIF")
+    parser.add_argument("--out", type=logx.path, metavar="FILE", help="the .npz of --record")
     parser.add_argument("--gains", choices=GAINS, default="authors")
     for name, i in (("K_P", 0), ("K_D", 1), ("K_I", 2)):
         parser.add_argument(f"--{name}", type=float, help=f"instead of that of --gains ({GAINS['authors'][i]})")
@@ -292,10 +304,9 @@ def main():
         parser.error("--record and --out: give both or neither")
     if flags.symmetry == "gas" and flags.stage != "demo":
         parser.error(f"--symmetry gas: needs --stage demo, not {flags.stage}")
-    for name in ("out", "gif"):
-        path = getattr(flags, name)
-        if path is not None and (Path(path).is_dir() or not Path(path).absolute().parent.is_dir()):
-            parser.error(f"--{name} {path}: is a folder, or its folder does not exist")
+    for name, suffix in (("out", ""), ("gif", ".gif")):
+        if getattr(flags, name) is not None:
+            check_output(parser, name, getattr(flags, name), suffix)
     gains = [
         own if own is not None else named
         for own, named in zip((flags.K_P, flags.K_D, flags.K_I), GAINS[flags.gains], strict=True)
@@ -313,18 +324,19 @@ def main():
         try:
             env = gymnasium.make(TASKS[flags.task].env_id, stage=flags.stage, partitions=flags.partitions,
                                  render_mode=mode, **size)  # fmt: skip
-        except ValueError as error:
-            parser.error(f"--watch: {error}")
-        pid = PID(env, gains, **way)
-        if flags.gif:
-            film({"PID": (env, lambda s: pid.act())}, flags.gif, [flags.seed + n for n in range(3)])
-            print(f"wrote {flags.gif}")
-        else:
-            for n in range(3):
+            pid = PID(env, gains, **way)
+            if flags.gif:
+                film({"PID": (env, lambda s: pid.act())}, flags.gif, [flags.seed + n for n in range(3)])
+                print(f"wrote {flags.gif}")
+            for n in range(0 if flags.gif else 3):
                 env.reset(seed=flags.seed + n)
                 while not any(env.step(pid.act())[2:4]):
                     pass
-        env.close()
+            env.close()
+        except ValueError as error:
+            parser.error(f"--{error}" if flags.gif else f"--watch: {error}")
+        except OSError as error:
+            parser.error(f"--gif {flags.gif}: cannot be written ({error.strerror or error})")
         return
 
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
@@ -342,12 +354,10 @@ def main():
     )
     if flags.record:
         meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))
-        temporary = f"{flags.out}.part"
-        with open(temporary, "wb") as file:
-            np.savez_compressed(file, **demos, meta=np.array(meta))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, flags.out)
+        try:
+            logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **demos, meta=np.array(meta)))
+        except OSError as error:
+            parser.error(f"--out {flags.out}: cannot be written ({error.strerror or error})")
         print(f"wrote {flags.out}")
 
 

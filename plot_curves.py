@@ -45,6 +45,8 @@ from matplotlib.figure import Figure  # without pyplot: a PNG is then always dra
 from matplotlib.lines import Line2D
 from scipy.stats import binomtest, bootstrap
 
+import logx
+
 HERE = Path(__file__).resolve().parent
 PAPER, RESULTS, RUNS, FIGURES = HERE / "data/paper", HERE / "data/results", HERE / "data/runs", HERE / "figures"
 SWEEPS = {"lambda": "lambda_BC", "demos": "N_demos", "baseline": "baseline", "pid": "PID", "other": "other"}
@@ -143,9 +145,11 @@ def read_paths(path):
     """The TCP paths in a trajectories.npz or demos-TASK.npz: [{"tcp": (length + 1, 3), "goal", "object": (3,), m,
     "success"}]; object is NaN where there is none."""
     file = read_npz(path, PATHS)
+    if odd := [name for name in ("length", "success") if file[name].ndim != 1]:
+        fail(f"{path}: array {odd[0]} is {file[odd[0]].shape}; (n,) is expected")
     if odd := [name for name in ("tcp", "goal", "object") if file[name].ndim != 2 or file[name].shape[1] != 3]:
         fail(f"{path}: array {odd[0]} is {file[odd[0]].shape}; (n, 3) is expected")
-    file["tcp"] = split_trials(path, file["tcp"], np.atleast_1d(file["length"])[:len(file["goal"])])
+    file["tcp"] = split_trials(path, file["tcp"], file["length"][:len(file["goal"])])
     return [{name: file[name][i] for name in PATHS} for i in range(min(map(len, file.values())))]
 
 
@@ -227,9 +231,14 @@ def find_runs(task, named, mixed=False):
         if first is not run:  # twice: fine only where one is the copy in data/results of the other, or of its beginning
             published = [r for r in (first, run) if r.path.is_relative_to(RESULTS.resolve())]
             n = min(first.returns.size, run.returns.size)
-            if not published or first.path.name != run.path.name or (first.returns[:n] != run.returns[:n]).any():
+            copied = published and first.path.name == run.path.name and not (first.returns[:n] != run.returns[:n]).any()
+            if not copied and (named or len(published) != 1):
                 fail(f"--runs: {first.path} and {run.path} are the same configuration and seed; one only is allowed")
-            runs[run.column, run.group, run.seed] = max(*published, first, run, key=lambda r: r.returns.size)
+            keep = (max(*published, first, run, key=lambda r: r.returns.size) if copied
+                    else next(r for r in (first, run) if r not in published))
+            if not copied:  # the same seed on another machine, or with other code
+                remarks.append(f"left out: {published[0].path}; {keep.path} is of the same configuration and seed")
+            runs[run.column, run.group, run.seed] = keep
     empty = [run for run in runs.values() if not run.returns.size and run.column != PID]
     remarks += [f"left out: {run.path} has no episode yet" for run in empty]
     runs = [run for run in runs.values() if run not in empty]
@@ -833,8 +842,9 @@ def check_whole(run, config):
         fail(f"--publish {run.path}: no evaluation.csv; run evaluate.py --pid first")
 
 
-def publish_run(folder):
-    """Puts a whole run, from a clean commit, at RESULTS/NAME in place of what is there."""
+def files_of_run(folder):
+    """What --publish writes of a run: (RESULTS/NAME, {file name: bytes}); exits with 2 where it is not whole, or of no
+    clean commit."""
     config = read_config(folder / "config.json")
     run = read_run(folder, config)
     check_whole(run, config)
@@ -850,25 +860,28 @@ def publish_run(folder):
         if (folder / name).exists():
             files[name] = (folder / name).read_bytes()
     if "policy.pt" in files:
-        import logx  # not above: it takes torch along
         try:
             logx.load_torch(folder / "policy.pt")
         except ValueError as error:
             fail(f"--publish {error}; weights alone are expected")
     elif run.column != PID and not folder.resolve().is_relative_to(RESULTS.resolve()):
         fail(f"--publish {folder}: no policy.pt; a run with a checkpoint is expected")
-    target = RESULTS / folder.resolve().name
+    return RESULTS / folder.resolve().name, files
+
+
+def put_run(target, files):
+    """Puts a run in place of what is there."""
     temporary = RESULTS / f".{target.name}.part"
     shutil.rmtree(temporary, ignore_errors=True)
     for name, data in reversed(files.items()):  # config.json last: without it, half a copy is no run
         write("--publish", temporary / name, lambda path, data=data: path.write_bytes(data))
     shutil.rmtree(target, ignore_errors=True)
     os.replace(temporary, target)
-    return target
 
 
-def publish_demos(path, episodes=40):
-    """Puts the TCP paths of a demonstration file's first episodes at RESULTS/demos-TASK.npz, for `read_paths`."""
+def files_of_demos(path, episodes=40):
+    """What --publish writes of a demonstration file: (RESULTS/demos-TASK.npz, its bytes), the TCP paths of the first
+    episodes for `read_paths`; exits with 2 where it is none."""
     file = read_npz(path, ("obs", "obs2", "length", "partition", "success", "meta"))
     try:
         task, length = json.loads(str(file["meta"]))["task"], file["length"][:episodes]
@@ -882,11 +895,9 @@ def publish_demos(path, episodes=40):
             raise ValueError("its arrays do not fit together")
     except (IndexError, KeyError, TypeError, ValueError) as error:
         fail(f"--publish {path}: not a demonstration file of pid_demo.py --record ({error})")
-    target = RESULTS / f"demos-{task}.npz"
     out = io.BytesIO()
     np.savez_compressed(out, **arrays)
-    write("--publish", target, lambda path: path.write_bytes(out.getvalue()))
-    return target
+    return RESULTS / f"demos-{task}.npz", out.getvalue()
 
 
 def index_row(run, config):
@@ -905,7 +916,12 @@ def index_row(run, config):
 
 def publish(sources):
     """Copies run folders (and demonstration files) into data/results and writes its index.csv. Returns remarks."""
-    published = [publish_demos(path) if path.suffix == ".npz" else publish_run(path) for path in sources]
+    found = [files_of_demos(path) if path.suffix == ".npz" else files_of_run(path) for path in sources]  # or ends here
+    for target, files in found:
+        if isinstance(files, dict):
+            put_run(target, files)
+        else:
+            write("--publish", target, lambda path, files=files: path.write_bytes(files))
     configs = {path.parent: read_config(path) for path in sorted(RESULTS.glob("[!.]*/config.json"))}
     rows = [index_row(read_run(folder, config), config) for folder, config in configs.items()]
     best = {}  # the run of each task and recipe that keeps its weights
@@ -923,9 +939,8 @@ def publish(sources):
     writer.writeheader()
     writer.writerows(rows)
     write("--publish", RESULTS / "index.csv", lambda path: path.write_text(out.getvalue(), encoding="utf-8"))
-    if size > 10e6:
-        fail(f"--publish: the policies in {RESULTS} take {size / 1e6:.1f} MB; at most 10 MB are allowed")
-    return [f"published {path}" for path in published] + [f"wrote {RESULTS / 'index.csv'}, {len(rows)} runs"]
+    return [*(f"published {target}" for target, _ in found), f"wrote {RESULTS / 'index.csv'}, {len(rows)} runs",
+            *[f"the policies there take {size / 1e6:.1f} MB: much for a repository"] * (size > 10e6)]
 
 
 # ------------------------------------------------------------------------------------------ main
@@ -995,13 +1010,14 @@ def main(argv=None):
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--table", choices=METRICS, help="print the paper's metrics beside ours")
     what.add_argument("--figure", choices=DRAW, help="draw a figure of the paper")
-    what.add_argument("--all", type=Path, metavar="OUT", help="write every table and figure into this folder")
-    what.add_argument("--publish", nargs="+", type=Path, metavar="RUN",
+    what.add_argument("--all", type=logx.path, metavar="OUT", help="write every table and figure into this folder")
+    what.add_argument("--publish", nargs="+", type=logx.path, metavar="RUN",
                       help="copy run folders, or a demonstration file of pid_demo.py, into data/results")
     parser.add_argument("--task", choices=TASKS, help="with --table and --figure")
-    parser.add_argument("--runs", nargs="+", metavar="FOLDER", help="run folders, or folders that hold some")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="with --table: write it as CSV too")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="with --figure: the .png or .pdf to write")
+    parser.add_argument("--runs", nargs="+", type=logx.path, metavar="FOLDER",
+                        help="run folders, or folders that hold some")
+    parser.add_argument("--csv", type=logx.path, metavar="FILE", help="with --table: write it as CSV too")
+    parser.add_argument("--out", type=logx.path, metavar="FILE", help="with --figure: the .png or .pdf to write")
     args = parser.parse_args(argv)
     if (args.csv and not args.table) or (args.out and not args.figure):
         fail("--csv goes with --table, --out with --figure")
@@ -1009,8 +1025,8 @@ def main(argv=None):
         fail(f"--out {args.out}: a name that ends in .png or .pdf is expected")
     if bool(args.task) != bool(args.table or args.figure and args.figure not in OF_NO_TASK):
         fail(f"--task: one of {', '.join(TASKS)} is expected with --table and with --figure of a task, not with others")
-    if args.publish and args.runs:
-        fail("--runs goes with --table, --figure and --all")
+    if args.runs and (args.publish or args.figure in OF_NO_TASK):
+        fail("--runs goes with --table, --all and --figure of a task")
     if args.publish:
         remarks = publish(args.publish)
     elif args.all:

@@ -32,7 +32,7 @@ import evaluate
 import gas
 import logx
 import pid_demo
-from kinova_env import TASKS, grasped
+from kinova_env import OBSERVATION, TASKS, grasped
 from logx import flag
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ class Flags:
     target_kl: float = flag(0.02, "largest D_KL from the policy that acted, on its own samples", low=0)
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic", low=0)
-    log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2")
+    log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128 on p2p, 256 1024 256 on p2po, 512 512 256 on pnp",
                                                 low=1)  # fmt: skip
     # the parts of the robust recipe (ours)
@@ -434,15 +434,18 @@ def train(flags, variant=""):
         if demos and flags.demos_in_B_o and "executed" in demos:
             logx.fail("--demos_in_B_o: B_o would not hold what was done where demonstrations were recorded with noise; "
                       "use --no-demos_in_B_o or --demo_noise 0")  # fmt: skip
-    run = logx.Run(folder, config, flags.tensorboard)
     torch.manual_seed(flags.seed)
+    obs_dim = sum(width for _, width, _ in OBSERVATION[flags.task])
+    try:
+        learner = Learner(flags, obs_dim)
+    except (RuntimeError, MemoryError):
+        logx.fail(f"--hidden_sizes {flags.hidden_sizes}: do not fit in memory")
+    run = logx.Run(folder, config, flags.tensorboard)
     rng = np.random.default_rng(flags.seed)  # exploration
     make = dict(max_episode_steps=flags.max_ep_len, disable_env_checker=True)
     env = gymnasium.make(TASKS[flags.task].env_id, stage="train", **make)
     eval_env = gymnasium.make(TASKS[flags.task].env_id, stage="test", **make)
-    obs_dim = env.observation_space.shape[0]
     view = gas.canonical if flags.symmetry == "canonical" else lambda obs: obs
-    learner = Learner(flags, obs_dim)
     total_steps = flags.epochs * flags.steps_per_epoch
 
     if run.checkpoint:
@@ -608,7 +611,8 @@ def main():
     flags, variant = complete(logx.parse_flags(Flags, __doc__))
     folder = train(flags, variant)
     if flags.quick:
-        agents = {str(folder): folder, f"PID, {flags.gains} gains": flags.gains}
+        gains = flags.gains or "fast"
+        agents = {str(folder): folder, f"PID, {gains} gains": gains}
         found = {name: evaluate.run_trials(flags.task, agent, 100, quiet=flags.quiet) for name, agent in agents.items()}
         evaluate.write(folder, *found[str(folder)])
         evaluate.print_table({name: rows for name, (rows, _) in found.items()})

@@ -31,6 +31,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+import logx
+
 HERE = Path(__file__).resolve().parent
 SCRIPTS = {"ddpg": "ddpg_demoease.py", "ppo": "ppo_demoease.py"}
 # Epochs and steps an epoch where no flag says otherwise (tab:reward, tab:reward2), and each recipe's symmetry.
@@ -305,7 +307,7 @@ def parse(argv):
     parser.add_argument("--symmetry", choices=("none", "gas", "so2", "canonical"), help="the recipe's by default")
     parser.add_argument("--epochs", type=int, help="the paper's by default")
     parser.add_argument("--steps_per_epoch", type=int)
-    parser.add_argument("--data_dir", type=Path, default=Path("data/runs"))
+    parser.add_argument("--data_dir", type=logx.path, default=Path("data/runs"))
     parser.add_argument("--jobs", type=int, help="runs at a time (1 here, 256 on Slurm)")
     parser.add_argument("--dry_run", action="store_true", help="print the commands and what they cost, and do nothing")
     parser.add_argument("--status", action="store_true", help="print how far each run is")
@@ -315,14 +317,16 @@ def parse(argv):
     parser.add_argument("--mem_gb", type=int, default=4, help="of a job, in GB")
     parser.add_argument("--signal_delay", type=int, default=90, metavar="SECONDS",
                         help="before its time is up a job is told to save its state")  # fmt: skip
-    argv, _, extra = " ".join(shlex.quote(word) for word in argv).partition(" -- ")
-    flags = parser.parse_args(shlex.split(argv))
-    flags.extra = shlex.split(extra)
+    own = argv[: argv.index("--")] if "--" in argv else argv
+    flags = parser.parse_args(own)
+    flags.extra = argv[len(own) + 1 :]
     for name in ("seeds", "epochs", "steps_per_epoch", "jobs", "time", "mem_gb", "signal_delay"):
         if getattr(flags, name) is not None and getattr(flags, name) < 1:
             parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
     if flags.time * 60 < flags.signal_delay + 60:  # Slurm may signal a minute early: then there is no job to hear it
         parser.error(f"--time {flags.time}: must be at least --signal_delay, {flags.signal_delay} s, and a minute more")
+    if flags.data_dir.exists() and not flags.data_dir.is_dir():
+        parser.error(f"--data_dir {flags.data_dir}: is a file, a folder is expected")
     if flags.first_seed < 0:
         parser.error(f"--first_seed {flags.first_seed}: must be at least 0")
     for word in flags.extra:

@@ -93,7 +93,7 @@ def test_a_row_follows_by_hand():
     n = 41  # the last 5 % are 2.05 steps: 3
     script = [(0.9 - 0.02 * t, -0.01 * t, 0.1 + 0.001 * t) for t in range(n)]
     env = Scripted(script, True, is_success=True, grasped=True)
-    row, errors, path = evaluate.trial(env, lambda s: s.copy(), 7)
+    row, errors, path, _ = evaluate.trial(env, lambda s: s.copy(), 7)
     assert list(row) == HEADER.split(",")
     assert row.pop("return") == pytest.approx(-0.01 * sum(range(n)))
     assert row.pop("effort_percent") == pytest.approx(100 * (0.1 + 0.001 * 20) / 2)  # of norm(tau_hat) <= 2
@@ -238,7 +238,7 @@ def test_metrics_are_nan_and_the_table_still_prints_where_no_trial_succeeded(cap
 def test_a_loaded_policy_acts_as_the_actor_did_in_training(tmp_path, task, symmetry):
     agent = learner(task, symmetry, seed=5)
     with torch.no_grad():
-        agent.net.mu.mul_(3)  # far into the tanh
+        agent.net.flat.mul_(3)  # far into the tanh
     policy = evaluate.load_policy(saved(tmp_path / "run", agent.policy()))
     env = gymnasium.make(TASKS[task].env_id, stage="train", disable_env_checker=True)
     env.action_space.seed(0)
