@@ -129,6 +129,8 @@ def read_npz(path, names):
             arrays = {name: file[name] for name in names}
         if odd := [name for name in names if arrays[name].dtype.kind not in "biuf" and name != "meta"]:
             raise ValueError(f"array {odd[0]} holds no numbers")
+        if odd := [name for name in ("length", "success") if name in names and arrays[name].ndim != 1]:
+            raise ValueError(f"array {odd[0]} is {arrays[odd[0]].shape}, not (n,)")
         return arrays
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         fail(f"{path}: {error}; a whole .npz with the arrays {', '.join(names)} is expected")
@@ -145,8 +147,6 @@ def read_paths(path):
     """The TCP paths in a trajectories.npz or demos-TASK.npz: [{"tcp": (length + 1, 3), "goal", "object": (3,), m,
     "success"}]; object is NaN where there is none."""
     file = read_npz(path, PATHS)
-    if odd := [name for name in ("length", "success") if file[name].ndim != 1]:
-        fail(f"{path}: array {odd[0]} is {file[odd[0]].shape}; (n,) is expected")
     if odd := [name for name in ("tcp", "goal", "object") if file[name].ndim != 2 or file[name].shape[1] != 3]:
         fail(f"{path}: array {odd[0]} is {file[odd[0]].shape}; (n, 3) is expected")
     file["tcp"] = split_trials(path, file["tcp"], file["length"][:len(file["goal"])])

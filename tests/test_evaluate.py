@@ -93,7 +93,8 @@ def test_a_row_follows_by_hand():
     n = 41  # the last 5 % are 2.05 steps: 3
     script = [(0.9 - 0.02 * t, -0.01 * t, 0.1 + 0.001 * t) for t in range(n)]
     env = Scripted(script, True, is_success=True, grasped=True)
-    row, errors, path, _ = evaluate.trial(env, lambda s: s.copy(), 7)
+    row, errors, path, start = evaluate.trial(env, lambda s: s.copy(), 7)
+    np.testing.assert_array_equal(start, [env.unwrapped.goal, [np.nan] * 3])
     assert list(row) == HEADER.split(",")
     assert row.pop("return") == pytest.approx(-0.01 * sum(range(n)))
     assert row.pop("effort_percent") == pytest.approx(100 * (0.1 + 0.001 * 20) / 2)  # of norm(tau_hat) <= 2
@@ -429,6 +430,11 @@ BAD = {
     "a GIF in no folder": (["{run}", "--gif", "{tmp}/nowhere/a.gif"], "--gif"),
     "a GIF of two tasks": (["{run}", "--pid", "--task", "pnp", "--gif", "{tmp}/a.gif"], "--gif"),
     "two tasks compared": (["--pid", "--task", "pnp", "--versus", "{run}"], "--versus"),
+    "a GIF named as a video": (["{run}", "--gif", "{tmp}/a.mp4"], ".gif"),
+    "a GIF of no name": (["{run}", "--gif="], "--gif"),
+    "no folder for the PID's trials": (["--pid", "--task", "p2p", "--out="], "--out"),
+    "a task of a run": (["{run}", "--task", "p2p"], "--task"),
+    "gains of a run": (["{run}", "--gains", "fast"], "--gains"),
     "a window for two": (["{run}", "--pid", "--task", "p2p", "--watch"], "--watch"),
     "a film twice": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
     "a trial before the first": (["{run}", "--gif", "{tmp}/a.gif", "--show", "-1"], "--show"),
@@ -455,3 +461,32 @@ def test_bad_input_is_exit_code_2_and_one_line_that_names_it(what, run_folder, t
     out, err = capsys.readouterr()
     assert code == 2 and not out and err.count("\n") == 1 and named in err
     assert sorted(tmp_path.rglob("*")) == before and not (run_folder / "evaluation.csv").exists()
+
+
+def test_a_film_that_cannot_be_written_is_one_line_and_leaves_nothing(run_folder, tmp_path, monkeypatch, capsys):
+    def no_room(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pid_demo.os, "replace", no_room)
+    assert main(monkeypatch, run_folder, "--gif", tmp_path / "a.gif", "--show", 0) == 2
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1 and "a.gif: cannot be written (No space left on device)" in err
+    assert not list(tmp_path.glob("*.gif")) and not list(tmp_path.glob(".part*"))
+
+
+def test_a_published_run_is_tested_and_left_as_it_is(run_folder, tmp_path, monkeypatch, capsys):
+    published = tmp_path / "results"
+    published.mkdir()
+    (published / "policy.pt").write_bytes((run_folder / "policy.pt").read_bytes())
+    (published / "evaluation.csv.gz").write_bytes(b"as it was")
+    assert main(monkeypatch, published, "--trials", 1) == 0
+    assert "stay as they are" in capsys.readouterr().out
+    assert sorted(path.name for path in published.iterdir()) == ["evaluation.csv.gz", "policy.pt"]
+
+
+def test_the_cube_of_a_pick_and_place_trial_is_where_it_was_at_the_start():
+    _, trajectories = evaluate.run_trials("pnp", "fast", trials=1, quiet=True)
+    env = gymnasium.make(TASKS["pnp"].env_id, stage="test")
+    env.reset(seed=evaluate.FIRST_SEED)
+    np.testing.assert_array_equal(trajectories["object"], [env.unwrapped.cube])
+    assert trajectories["success"][0] and np.linalg.norm(trajectories["object"] - trajectories["goal"]) > 0.06

@@ -463,3 +463,44 @@ def test_seconds_do_not_follow_a_clock_that_jumps_back(tmp_path, monkeypatch):
     run = logx.Run(tmp_path / "run", CONFIG)
     monkeypatch.setattr(time, "time", lambda: -1e9)
     assert 0 <= run.seconds() < 100
+
+
+def spoiled(name, content):
+    """Something to do to a run's folder: `content` in place of the file `name`, None for nothing, "/" for a folder."""
+
+    def spoil(folder):
+        (folder / name).unlink()
+        if content == "/":
+            (folder / name).mkdir()
+        elif content is not None:
+            (folder / name).write_bytes(content)
+
+    return spoil
+
+
+def stored(value):
+    file = io.BytesIO()
+    torch.save(value, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("spoil, says", [
+    (spoiled("config.json", b"{"), "config.json"), (spoiled("config.json", b"[]"), "config.json"),
+    (spoiled("config.json", b"{}"), "config.json"), (spoiled("config.json", None), "config.json"),
+    (spoiled("checkpoint.pt", stored([1])), "another version"),
+    (spoiled("checkpoint.pt", stored({"format": logx.FORMAT})), "another version"),
+], ids=["cut", "a list", "empty", "gone", "a checkpoint that is a list", "a checkpoint without its parts"])  # fmt: skip
+def test_a_folder_that_cannot_be_gone_on_with_is_one_line(tmp_path, capsys, spoil, says):
+    run = begin(tmp_path / "a", CONFIG)
+    run.save({}, CONFIG, {})
+    close(run)
+    spoil(tmp_path / "a")
+    error = error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
+    assert "--resume" in error and says in error and "go on from its last" not in error
+
+
+def test_a_run_of_the_other_algorithm_is_refused_by_its_name(tmp_path, capsys):
+    run = begin(tmp_path / "a", CONFIG | {"algo": "ddpg", "act_noise": 0.1})
+    run.save({}, CONFIG | {"algo": "ddpg", "act_noise": 0.1}, {})
+    close(run)
+    assert "a run of ddpg, not of ppo" in error_line(capsys, begin, tmp_path / "a", CONFIG | {"algo": "ppo"}, True)

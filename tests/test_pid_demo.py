@@ -434,6 +434,7 @@ BAD = [  # arguments ({} is an empty folder), what the line names
     ("--record 1 --out {}", "--out"),
     ("--gif {}/none/x.gif", "none/x.gif"),
     ("--gif {}", "--gif"),
+    ("--gif {}/x.mp4", ".gif"),
     ("--trials 1 --gains quick", "quick"),
     ("--trials 1 --K_P -1", "K_P"),
     ("--trials 1 --K_D nan", "K_D"),
@@ -472,6 +473,27 @@ def test_empty_file_name_is_bad_input_too(monkeypatch, tmp_path, capsys):
             run(monkeypatch, *arguments)
         assert stopped.value.code == 2 and capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("flags, file", [(("--record", 1, "--out"), "x.npz"), (("--gif",), "x.gif")])
+def test_a_file_that_cannot_be_written_is_one_line_and_leaves_nothing(monkeypatch, tmp_path, capsys, flags, file):
+    def no_room(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pid_demo.os, "replace", no_room)
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, *flags, tmp_path / file, "--gains", "fast")
+    err = capsys.readouterr().err.splitlines()[-1]
+    assert stopped.value.code == 2 and f"{file}: cannot be written (No space left on device)" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_sectors_too_narrow_to_film_in_are_one_line(monkeypatch, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, "--gif", tmp_path / "x.gif", "--task", "pnp", "--partitions", 200)
+    err = capsys.readouterr().err
+    assert stopped.value.code == 2 and err.count("\n") == 1 and "--partitions 200" in err
+    assert not list(tmp_path.iterdir())
 
 
 def test_trials_print_success_length_return_and_effort_and_write_nothing(monkeypatch, tmp_path, capsys):

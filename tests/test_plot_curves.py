@@ -367,6 +367,16 @@ def test_two_runs_of_one_configuration_and_seed_clash(tmp_path, capsys, one, oth
     assert str(tmp_path / one) in err and str(tmp_path / other) in err
 
 
+def test_a_rerun_of_a_published_run_is_shown_in_its_place_and_that_is_said(tmp_path, capsys):
+    write_run(tmp_path / "results/a", [1.0] * 60)
+    write_run(tmp_path / "runs/a", [2.0] * 60)
+    out, rows = table(capsys)
+    assert cell(rows, "R90")["seeds"] == "1" and float(cell(rows, "R90")["mean"]) == 2
+    assert f"left out: {tmp_path / 'results/a'}; {tmp_path / 'runs/a'} is of the same" in out
+    write_run(tmp_path / "runs/b", [3.0] * 60)  # which of the two is a guess
+    assert "one only is allowed" in error_line(capsys, "--table", "training", "--task", "p2p")
+
+
 # ------------------------------------------------------------------------------------------ figures
 
 def test_the_figure_draws_each_sweep_with_the_baseline_and_the_papers_R90(tmp_path):
@@ -599,6 +609,7 @@ def respoil(path, **arrays):
     (lambda run: pickled(run / "trajectories.npz"), "allow_pickle=False"),
     (lambda run: respoil(run / "trajectories.npz", error=np.zeros(3)), "do not fit together"),
     (lambda run: respoil(run / "trajectories.npz", goal=np.zeros(2)), "(n, 3) is expected"),
+    (lambda run: respoil(run / "trajectories.npz", success=np.array(True)), "not (n,)"),
     (lambda run: respoil(run / "trajectories.npz", success=np.array(["yes", "no"])), "holds no numbers"),
     (lambda run: (run / "evaluation.csv").write_text("trial,success\n0,1\n"), "no column length"),
     (lambda run: (run / "evaluation.csv").unlink(), "trajectories.npz is not of"),
@@ -608,6 +619,12 @@ def test_a_run_that_is_not_whole_or_of_no_clean_commit_is_not_published(tmp_path
     spoil(run)
     err = error_line(capsys, "--publish", run)
     assert str(run) in err and says in err and not (tmp_path / "results/a").exists()
+
+
+def test_nothing_is_published_where_one_of_several_is_not_whole(tmp_path, capsys):
+    good = write_publishable(tmp_path / "runs/a")
+    assert "nowhere" in error_line(capsys, "--publish", good, tmp_path / "nowhere")
+    assert not (tmp_path / "results").exists()
 
 
 # ------------------------------------------------------------------------------------------ bad input
@@ -620,7 +637,8 @@ TABLE = ("--table", "training", "--task", "p2p")
     (("--table", "training", "--task", "walk"), "'p2p', 'p2po', 'pnp'"),
     (("--table", "tests", "--task", "p2p"), "--table"), (("--figure", "error"), "--task"),
     (("--all", "x", "--task", "p2p"), "--task"), (("--figure", "workspace", "--task", "p2p"), "--task"),
-    (("--publish", "x", "--runs", "x"), "--runs"), (("--all", "x", "--csv", "x.csv"), "--csv"),
+    (("--publish", "x", "--runs", "x"), "--runs"), (("--figure", "partitions", "--runs", "x"), "--runs"),
+    ((*TABLE, "--runs", ""), "--runs"), (("--all", ""), "--all"), (("--all", "x", "--csv", "x.csv"), "--csv"),
     ((*TABLE, "--figure", "learning"), "--figure"), ((*TABLE, "--out", "x.png"), "--out"),
     ((*TABLE, "--sed", "1"), "--sed"), (("--tab", "training", "--task", "p2p"), "--table"),
     (("--figure", "learning", "--task", "p2p", "--csv", "x.csv"), "--csv"),

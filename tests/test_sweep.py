@@ -103,7 +103,8 @@ def test_columns_are_named_as_the_tables_vary_them_and_chosen_by_name():
     (["--jobs", "0"], "--jobs 0"), (["--first_seed", "-1"], "--first_seed -1"), (["--recipe", "best"], "best"),
     (["--time", "0"], "--time 0"), (["--time", "2"], "--time 2"), (["--cluster", "pbs"], "pbs"),
     (["--", "--seed", "3"], "--seed"), (["--", "--name=x"], "--name"),
-    (["--task", "pnp", "--columns", "lambda=1.8"], "lambda=1.8"),
+    (["--task", "pnp", "--columns", "lambda=1.8"], "lambda=1.8"), (["--data_dir", __file__], "--data_dir"),
+    (["--data_dir", ""], "--data_dir"), (["--status", "--", "--gamma", "0.9", "--quick"], "--quick"),
 ])  # fmt: skip
 def test_bad_input_is_one_line_that_names_it_and_exit_code_2(flags, says, capsys):
     with pytest.raises(SystemExit) as stopped:
@@ -111,6 +112,10 @@ def test_bad_input_is_one_line_that_names_it_and_exit_code_2(flags, says, capsys
     assert stopped.value.code == 2
     error = capsys.readouterr().err.splitlines()
     assert "error:" in error[-1] and says in error[-1]
+
+
+def test_flags_of_the_scripts_may_stand_alone():
+    assert sweep.parse(["--", "--gamma", "0.9"]).extra == ["--gamma", "0.9"]
 
 
 def test_flag_that_the_script_refuses_is_said_before_anything_is_begun(tmp_path):
