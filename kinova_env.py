@@ -206,6 +206,9 @@ class KinovaEnv(gymnasium.Env):
     | collision | -2 on collision |
     | grasping | 2 at the first grasp (P&P) |
 
+    The cube is grasped once the TCP is within 0.05 m of it and the gripper within 0.3 rad of horizontal and of the
+    azimuth that the cube was drawn at; it then stays in the gripper.
+
     ## Starting state
     Cylinder coordinates (theta, rho, z) of TCP, goal and cube, tool horizontal and radially outward:
 

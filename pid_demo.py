@@ -118,7 +118,7 @@ def record(
 
     symmetry "gas": ceil(num_demos / partitions) real episodes in partition 0, each mapped to the others, the surplus
     dropped; any other: num_demos real episodes in uniformly drawn partitions. Returns (demos, env_steps): the arrays of
-    DESIGN's demonstration file, and how many steps of the environment they took.
+    a demonstration file (data/README.md), and how many steps of the environment they took.
     """
     env = gymnasium.make(TASKS[task].env_id, stage=stage, partitions=partitions, disable_env_checker=True)
     pid, rng = PID(env, gains, **way), np.random.default_rng((seed, 1))

@@ -9,7 +9,7 @@
 Two recipes. `paper` is the algorithm as printed. `robust` begins with a clone of the demonstrations (which are recorded
 with noise, and go into B_d alone), and then lets PPO take small steps from it, the cloning never masked; each part is a
 flag of its own. README.md has every measured figure and the list of differences from the paper; where table and
-algorithm are silent, the values are Spinning Up's. GAE, and the policy that the ratio and D_KL refer to, are those of
+algorithm are silent, the values are Spinning Up's (but the networks are of ReLU, as DDPG's). GAE, and the policy that the ratio and D_KL refer to, are those of
 the epoch's beginning (Spinning Up), where the algorithm prints them anew for every update k.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
@@ -55,7 +55,7 @@ class Flags:
     seed: int = flag(0, low=0, high=2**32 - 1)
     # length (tab:reward2)
     epochs: int | None = flag(None, "N_ep; 50", low=1)
-    steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1)
+    steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1, high=10_000_000)
     max_ep_len: int | None = flag(None, "T; 400, 500, 800", low=1)
     # the algorithm (tab:reward2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
     demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch until B_d is full; N_demos / 5, "
@@ -230,7 +230,7 @@ class ActorCritic(nn.Module):
         return -(0.5 * z**2 + self.log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def kl(self, mu, mu_old, log_std_old):
-        """D_KL(pi_old, pi) in closed form, averaged over the batch."""
+        """D_KL(pi_old, pi) in closed form, averaged over the batch (spinningup's order)."""
         var = (2 * (log_std_old - self.log_std)).exp()
         z = (mu - mu_old) / self.log_std.exp()
         return 0.5 * (var + z**2 - 1 - var.log()).sum(-1).mean()
