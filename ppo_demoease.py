@@ -9,8 +9,9 @@
 Two recipes. `paper` is the algorithm as printed. `robust` begins with a clone of the demonstrations (which are recorded
 with noise, and go into B_d alone), and then lets PPO take small steps from it, the cloning never masked; each part is a
 flag of its own. README.md has every measured figure and the list of differences from the paper; where table and
-algorithm are silent, the values are Spinning Up's (but the networks are of ReLU, as DDPG's). GAE, and the policy that the ratio and D_KL refer to, are those of
-the epoch's beginning (Spinning Up), where the algorithm prints them anew for every update k.
+algorithm are silent, the values are Spinning Up's (but ReLU networks, as DDPG's). GAE, and the policy that the ratio
+and D_KL refer to, are those of the epoch's beginning (Spinning Up), where the algorithm prints them anew for every
+update k.
 A run is a folder, DATA_DIR/NAME: see logx.py.
 """
 
