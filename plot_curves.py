@@ -75,7 +75,7 @@ CSV_HEADER = ["task", "sweep", "num_demos", "lambda_bc", "algo", "recipe", "symm
 INDEX_HEADER = ["name", "task", "algo", "recipe", "symmetry", "variant", "num_demos", "lambda_bc", "seed", "env_steps",
                 "finished", "eval_success", "P_scs_percent", "git_commit"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe & Ito: safe for colour-blind eyes
-DASHES = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1.5, 1)))  # one a group, so that colour is free for the column
+DASHES = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1.5, 1)), (0, (8, 1, 1, 1, 1, 1)), (0, (1, 2)))  # one a group
 GREEN, GREY, BORDER = COLOURS[2], "#555555", (0, (4, 2))  # the tube of reachable positions, the borders of sectors
 LOOK = {"font.family": "STIXGeneral", "mathtext.fontset": "stix", "font.size": 8, "legend.fontsize": 7,
         "legend.title_fontsize": 7, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
