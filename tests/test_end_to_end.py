@@ -103,6 +103,8 @@ class Process:
         self.files = {stream: folder / f"{name}.{stream}" for stream in ("out", "err")}
         argv = [str(ROOT / argv[0]), *map(str, argv[1:])]
         paths = {stream: str(path) for stream, path in self.files.items()}
+        for path in self.files.values():
+            path.touch()  # it may be killed before it has opened them
         self.pid = server.ask(argv=argv, cwd=str(folder), first=first, **paths)
 
     def poll(self):
