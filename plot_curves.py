@@ -234,10 +234,11 @@ def find_runs(task, named, mixed=False):
             copied = published and first.path.name == run.path.name and not (first.returns[:n] != run.returns[:n]).any()
             if not copied and (named or len(published) != 1):
                 fail(f"--runs: {first.path} and {run.path} are the same configuration and seed; one only is allowed")
-            keep = (max(*published, first, run, key=lambda r: r.returns.size) if copied
-                    else next(r for r in (first, run) if r not in published))
-            if not copied:  # the same seed on another machine, or with other code
-                remarks.append(f"left out: {published[0].path}; {keep.path} is of the same configuration and seed")
+            if copied:
+                keep = max(*published, first, run, key=lambda r: r.returns.size)
+            else:  # the same seed on another machine, or with other code: the own one, once it is finished
+                keep, other = sorted((first, run), key=lambda r: (bool(r.unfinished), r in published))
+                remarks.append(f"left out: {other.path}; {keep.path} is of the same configuration and seed")
             runs[run.column, run.group, run.seed] = keep
     empty = [run for run in runs.values() if not run.returns.size and run.column != PID]
     remarks += [f"left out: {run.path} has no episode yet" for run in empty]

@@ -373,6 +373,12 @@ def test_a_rerun_of_a_published_run_is_shown_in_its_place_and_that_is_said(tmp_p
     out, rows = table(capsys)
     assert cell(rows, "R90")["seeds"] == "1" and float(cell(rows, "R90")["mean"]) == 2
     assert f"left out: {tmp_path / 'results/a'}; {tmp_path / 'runs/a'} is of the same" in out
+    finished = (tmp_path / "runs/a/progress.csv").read_text()
+    (tmp_path / "runs/a/progress.csv").write_text("epoch,env_steps,EpRet,eval_success\n1,2000,,0.5\n")
+    out, rows = table(capsys)
+    assert cell(rows, "R90")["seeds"] == "1" and float(cell(rows, "R90")["mean"]) == 1
+    assert f"left out: {tmp_path / 'runs/a'}; {tmp_path / 'results/a'} is of the same" in out
+    (tmp_path / "runs/a/progress.csv").write_text(finished)
     write_run(tmp_path / "runs/b", [3.0] * 60)  # which of the two is a guess
     assert "one only is allowed" in error_line(capsys, "--table", "training", "--task", "p2p")
 
