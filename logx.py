@@ -1,24 +1,32 @@
-"""A run's folder: what was asked (config.json), its curves (episodes.csv, progress.csv) and its checkpoint.
+"""What all scripts share: flags, bad input, whole files, and a run's folder.
 
-    flags = logx.parse_flags(Flags, __doc__)          # a dataclass of typed flags, as a command line
-    run = logx.Run(folder, config)                    # goes on from run.checkpoint, where it is not None
-    run.write("episodes", {...}); run.write("progress", {...}); run.save(state, config, policy)
+    flags = logx.parse_flags(Flags, __doc__)      # a dataclass as command line
+    with logx.RunFolder(flags, "ddpg", columns) as run:
+        run.begin(demo_env_steps); run.log_episode(...); run.log_epoch(...)
+        run.save(state, policy)
+    logx.run_script(main)                         # exit codes of bad input, NaN
 
-What is on disk is always whole: files are written beside their place, fsynced and renamed, and on a resume the curves
-are cut back to the checkpoint they belong to, so that a killed and resumed run equals one that was never killed.
+A run's folder holds what was asked (config.json), its curves (episodes.csv,
+progress.csv), its checkpoint and its policy. What is on disk is always whole:
+files are written beside their place, fsynced and renamed. On a resume the
+curves are cut back to the checkpoint, so that a killed and resumed run equals
+one that was never killed.
 """
 
 import argparse
 import contextlib
 import csv
 import dataclasses
+import difflib
 import fcntl
 import json
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
+import threading
 import time
 import types
 import typing
@@ -27,39 +35,58 @@ import zlib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import gymnasium
+import numpy as np
+from tqdm import tqdm
+
 EPISODES = ["episode", "env_steps", "return", "length", "success", "collision"]
-PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success", "L_O", "L_BC", "L_C", "L_A"]
-PROGRESS += ["mask_fraction", "Q_mean", "Q_max", "pretanh_own", "pretanh_demo", "bc_relative_error"]
-PROGRESS += ["eval_success", "eval_return"]
+PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success"]  # then what is measured,
+EVALUATED = ["eval_success", "eval_return"]  # and the validation trials
+FORMAT = 3  # of a checkpoint: raised where older ones cannot go on
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is what Slurm sends before the time is up
 
 
-def fail(message):
-    """Bad input: one line on standard error, exit code 2."""
-    print(f"{Path(sys.argv[0]).name}: error: {message}", file=sys.stderr)
-    raise SystemExit(2)
+# ---- bad input, exit codes -------------------------------------------------------------------------------------------
 
 
-def parse_flags(cls, doc, argv=None):
-    """The command line of a dataclass: a field is a flag, its annotation the type, metadata the help and the choices.
+class BadInput(ValueError):
+    """What a user asked for and cannot have: names the flag or file, says what is wrong and what is allowed."""
 
-    `X | None` fields default to what the task or recipe says; bools become --flag and --no-flag; tuples take spaces.
-    """
-    parser = argparse.ArgumentParser(
-        description=doc, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    for field in dataclasses.fields(cls):
-        kind = typing.get_type_hints(cls)[field.name]
-        if isinstance(kind, types.UnionType):
-            kind = next(k for k in typing.get_args(kind) if k is not type(None))
-        options = {"default": field.default, "help": field.metadata.get("help")}
-        if kind is bool:
-            options["action"] = argparse.BooleanOptionalAction
-        elif typing.get_origin(kind) is tuple:
-            options |= {"type": int, "nargs": "+"}
-        else:
-            options |= {"type": kind, "choices": field.metadata.get("choices")}
-        parser.add_argument(f"--{field.name}", **options)
-    return cls(**vars(parser.parse_args(argv)))
+
+class NotFinite(ArithmeticError):
+    """A loss, a weight or an action became NaN or infinite."""
+
+
+def run_script(main):
+    """Runs a script's main() and ends the process: 0 done, 2 bad input, 3 NaN, 130 interrupted, each with one line."""
+    code, message = 0, ""
+    try:
+        code = main() or 0
+    except BadInput as error:
+        code, message = 2, f"error: {one_line(error)}"
+    except NotFinite as error:
+        code, message = 3, f"error: {one_line(error)}"
+    except KeyboardInterrupt as interrupt:
+        code, message = 130, " ".join(map(str, interrupt.args))
+    except BrokenPipeError:  # the reader of our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if message:
+        print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def one_line(error):
+    """An exception, or a text, as one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+# ---- flags -----------------------------------------------------------------------------------------------------------
+
+
+def flag(default, help=None, choices=None, low=None, high=None, positional=False, metavar=None):
+    """A dataclass field that is a command-line flag; low and high are the smallest and largest allowed values."""
+    about = dict(help=help, choices=choices, low=low, high=high, positional=positional, metavar=metavar)
+    return dataclasses.field(default=default, metadata=about)
 
 
 def path(text):
@@ -69,71 +96,146 @@ def path(text):
     return Path(text)
 
 
-def flag(default, help=None, choices=None, low=None, high=None):
-    """A dataclass field that is a command-line flag; low and high are the smallest and largest allowed values."""
-    return dataclasses.field(default=default, metadata=dict(help=help, choices=choices, low=low, high=high))
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        raise BadInput(message)
 
 
-def check_ranges(flags):
-    """Exits with 2 and a line that names the flag where a number is outside what its field allows."""
+def parse_flags(cls, doc, argv=None):
+    """The command line of a dataclass whose fields are made by `flag`: its name is the flag, its annotation the type.
+
+    `X | None` defaults to what the help says; `bool` is --flag, `bool | None` also --no-flag; tuples take spaces;
+    `bool | str` may stand alone or with a value. Raises BadInput where a value is not allowed.
+    """
+    parser = _Parser(description=doc, usage=argparse.SUPPRESS, allow_abbrev=False,
+                     formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    hints = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        if not field.metadata:
+            continue
+        about, kind = field.metadata, hints[field.name]
+        kinds = [k for k in typing.get_args(kind) if k is not type(None)] if isinstance(kind, types.UnionType) else []
+        shown = field.default
+        if isinstance(shown, tuple):
+            shown = " ".join(map(str, shown))
+        default = "" if shown is None or isinstance(shown, bool) or shown == "" else f"(default: {shown})"
+        options = {"default": field.default, "help": f"{about['help'] or ''} {default}".strip().replace("%", "%%")}
+        if kinds == [bool, str]:
+            options |= {"nargs": "?", "const": True, "metavar": about["metavar"]}
+        elif kind is bool and not field.default:
+            options |= {"action": "store_true"}
+        elif bool in (kind, *kinds):
+            options |= {"action": argparse.BooleanOptionalAction}
+        else:
+            kind = kinds[0] if kinds else kind
+            if typing.get_origin(kind) is tuple:
+                kind, *rest = typing.get_args(kind)
+                many = "*" if about["positional"] else "+"
+                options |= {"nargs": many if rest == [...] else 1 + len(rest)}
+            options |= {"type": path if kind is Path else kind, "choices": about["choices"]}
+            options |= {"metavar": about["metavar"]} if about["metavar"] else {}
+        parser.add_argument(field.name if about["positional"] else f"--{field.name}", **options)
+    values, unknown = parser.parse_known_args(argv)
+    if unknown:
+        raise BadInput(_no_such_flag(unknown[0], [f"--{field.name}" for field in dataclasses.fields(cls)]))
+    for name, value in vars(values).items():
+        setattr(values, name, tuple(value) if isinstance(value, list) else value)
+    return check_flags(cls(**vars(values)))
+
+
+def _no_such_flag(word, flags):
+    """--batch-size and --batchsize are told --batch_size."""
+    name = word.split("=")[0]
+    near = [f for f in flags if f == name.replace("-", "_").replace("__", "--", 1)]
+    near = near or difflib.get_close_matches(name, flags, 1)
+    return f"{name}: no such flag" + (f"; did you mean {near[0]}?" if near else "; --help lists them")
+
+
+def check_flags(flags):
+    """The flags, as they are. Raises BadInput with the flag's name where a value is outside what its field allows."""
     for field in dataclasses.fields(flags):
-        low, high = field.metadata.get("low"), field.metadata.get("high")
+        low, high, choices = (field.metadata.get(key) for key in ("low", "high", "choices"))
         value = getattr(flags, field.name)
         for x in value if isinstance(value, (tuple, list)) else (value,):
-            if x is None or isinstance(x, (bool, str)):
+            if x is not None and choices and x not in choices:
+                raise BadInput(f"--{field.name} {x}: must be one of {', '.join(map(str, choices))}")
+            if x is None or isinstance(x, (bool, str, Path)):
                 continue
             if not math.isfinite(x) or (low is not None and x < low) or (high is not None and x > high):
-                allowed = " and ".join(
-                    f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None
-                )
-                finite = "" if math.isfinite(x) else "a finite number" + " " * bool(allowed)
-                fail(f"--{field.name} {x}: must be {finite}{allowed}")
+                bounds = [f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None]
+                allowed = " and ".join(bounds) or "a finite number"
+                raise BadInput(f"--{field.name} {x}: must be {allowed}")
+    return flags
 
 
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
-NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume"}
-NOT_A_VARIANT |= {"device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard"}
+NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume",
+                 "device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard",
+                 "variant"}  # fmt: skip
 
 
-def name_run(flags, printed, algo):
-    """Gives the flags a name where they have none. Returns the variant: what differs from `printed`, the recipe's own.
-    Exits with 2 where the name is no folder's or the device is not here."""
-    asked = dataclasses.asdict(flags).items()
-    changed = {key: value for key, value in asked if key not in NOT_A_VARIANT and value != getattr(printed, key)}
+def name_run(flags, recipe, algo):
+    """Fills in flags.variant, what differs from `recipe` (the recipe's own flags), and the name where there is none.
+
+    Raises BadInput where the name is no folder's or the device is not here."""
+    changed = {key: value for key, value in dataclasses.asdict(flags).items()
+               if key not in NOT_A_VARIANT and value != getattr(recipe, key)}  # fmt: skip
     if flags.demos is not None:  # what they were recorded with is said by the file, not by these flags
         flags.gains = flags.demo_noise = None
         changed = {key: value for key, value in changed.items() if key not in ("gains", "demo_noise")}
         changed["demos"] = Path(flags.demos).name
     variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
-    if len(variant) > 80:
-        variant = f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
+    flags.variant = variant if len(variant) <= 80 else f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
     if flags.name is None:
-        flags.name = f"{flags.task}-{algo}-{flags.recipe}-N{flags.num_demos}-lambda{flags.lambda_bc:g}-{flags.symmetry}"
-        flags.name += f"{'-' * bool(variant)}{variant}-seed{flags.seed}{'-quick' * flags.quick}"
+        length = f"epochs={flags.epochs}" if flags.epochs != recipe.epochs else ""
+        words = [flags.task, algo, flags.recipe, f"N{flags.num_demos}", f"lambda{flags.lambda_bc:g}", flags.symmetry]
+        flags.name = "-".join([*words, *filter(None, (flags.variant, length)), f"seed{flags.seed}"])
     if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
-        fail(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
-    if not flags.data_dir:
-        fail("--data_dir '': must be a folder; . is the present one")
+        raise BadInput(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
+    if not str(flags.data_dir):
+        raise BadInput("--data_dir '': must be a folder; . is the present one")
     if flags.device == "cuda":
         import torch
 
         if not torch.cuda.is_available():
-            fail("--device cuda: torch sees no GPU here; use --device cpu")
-    return variant
+            raise BadInput("--device cuda: torch sees no GPU here; use --device cpu")
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
 
 
 def atomic_write(path, write):
-    """Calls write(file) on a binary file beside `path`, then puts it in place whole (fsync, rename)."""
+    """Calls write(file) on a binary file beside `path`, then puts it in place whole (fsync, rename). `write` may also
+    be the text or bytes themselves."""
     temporary = Path(f"{path}.part")
     try:
         with open(temporary, "wb") as file:
-            write(file)
+            if callable(write):
+                write(file)
+            else:
+                file.write(write.encode() if isinstance(write, str) else write)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def load_torch(path):
+    """torch.load of tensors and plain types only. Raises BadInput with what is wrong with the file."""
+    import torch  # here and below: seconds, which scripts that do not learn are spared
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, weights_only=True, map_location="cpu")
+    except FileNotFoundError:
+        raise BadInput(f"{path}: no such file") from None
+    except (PermissionError, IsADirectoryError) as error:
+        raise BadInput(f"{path}: {error.strerror}") from None
+    except Exception:  # garbled bytes end in an exception of any kind
+        raise BadInput(f"{path}: cut short, or holds more than tensors and plain types (and is not loaded)") from None
 
 
 def versions():
@@ -152,158 +254,282 @@ def versions():
     return made_with | {"git_commit": commit or "unknown"}
 
 
-def load_torch(path):
-    """torch.load of tensors and plain types only. Raises ValueError with what is wrong with the file."""
-    import torch  # here and below: seconds, which scripts that do not learn are spared
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return torch.load(path, weights_only=True, map_location="cpu")
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (PermissionError, IsADirectoryError) as error:
-        raise ValueError(f"{path}: {error.strerror}") from None
-    except Exception:  # garbled bytes end in an exception of any kind
-        raise ValueError(f"{path}: cut short, or holds more than tensors and plain types (and is not loaded)") from None
+# ---- the environment of a run ----------------------------------------------------------------------------------------
 
 
-def one_line(error):
-    """An exception as one line."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
+class Replayable(gymnasium.Wrapper):
+    """An environment whose unfinished episode fits into a checkpoint: as the random state it began with and the actions
+    since, which are played again (PyBullet's state is not enough to go on exactly). At its end info["episode"] holds
+    the return "r" and the length "l", as with gymnasium's RecordEpisodeStatistics."""
+
+    def __init__(self, env, seed):
+        super().__init__(env)
+        env.reset(seed=seed)
+
+    def reset(self, *, seed=None, options=None):
+        self._began = self.unwrapped.np_random.bit_generator.state
+        self._actions, self._return = [], 0.0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        s, r, terminated, truncated, info = self.env.step(action)
+        self._actions.append(action)
+        self._return += r
+        if terminated or truncated:
+            info["episode"] = {"r": self._return, "l": len(self._actions)}
+        return s, r, terminated, truncated, info
+
+    def state(self):
+        return {"began": json.dumps(self._began), "actions": [a.tolist() for a in self._actions]}
+
+    def load(self, state):
+        """Plays the episode of `state` again. Returns the observation it had come to."""
+        self.unwrapped.np_random.bit_generator.state = json.loads(state["began"])
+        s, _ = self.reset()
+        for a in state["actions"]:
+            s, *_ = self.step(np.array(a, dtype=np.float32))
+        return s
 
 
-def is_new(folder, resume):
-    """Whether a run in this folder starts from nothing (else: from its checkpoint); exits with 2 if it may not."""
-    try:
-        if folder.exists() and not folder.is_dir():
-            fail(f"--name {folder.name}: {folder} is a file")
-        if folder.exists() and any(folder.iterdir()) and not resume:
-            fail(f"--name {folder.name}: {folder} exists; go on with --resume, or choose another --name")
-        return not (folder / "checkpoint.pt").exists()
-    except OSError as error:
-        fail(f"--name {folder.name}: {folder} cannot be read ({error.strerror})")
+# ---- a run's folder --------------------------------------------------------------------------------------------------
 
 
-FORMAT = 2  # of a checkpoint: raised where older ones cannot go on
+class RunFolder:
+    """One run's folder, held by this process until the `with` block ends; `checkpoint` is None or what was saved.
 
+    flags: of an algorithm script; measured: the names of what `log_updates` is given, which become columns of
+    progress.csv; fixed_length: a resume may not change --epochs, since something falls over the run's length. Raises
+    BadInput for whatever is wrong with the folder, another process that holds it included.
+    """
 
-class Run:
-    """One run folder, held until the process ends; goes on from the checkpoint there, if any. What is wrong with the
-    folder, another process that holds it included, exits with 2."""
-
-    def __init__(self, folder, config, tensorboard=False):
-        self.folder = Path(folder)
-        if tensorboard:
+    def __init__(self, flags, algo, measured, fixed_length=False):
+        self.flags, self.folder = flags, Path(flags.data_dir) / flags.name
+        self.total_steps = flags.epochs * flags.steps_per_epoch
+        self.columns = {"episodes": EPISODES, "progress": [*PROGRESS, *measured, *EVALUATED]}
+        self._config = dataclasses.asdict(flags) | {"algo": algo, "resume": bool(flags.resume)}
+        self._fixed_length, self._files, self._board, self._bar = fixed_length, {}, None, None
+        self.stop_signals = []
+        self._log = {"episodes": 0, "epoch_episodes": [], "epoch_updates": [], "demo_env_steps": 0}
+        if flags.tensorboard:
             try:
-                from torch.utils.tensorboard import SummaryWriter
+                import torch.utils.tensorboard  # noqa: F401
             except ImportError:
-                fail("--tensorboard: the tensorboard package is not installed (pip install tensorboard)")
+                raise BadInput("--tensorboard: the tensorboard package is not installed (pip install tensorboard)") from None
+        self._take()
+
+    def _take(self):
+        """Holds the folder and reads its checkpoint."""
+        folder, name = self.folder, f"--name {self.folder.name}"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = open(self.folder / "lock", "w")  # noqa: SIM115 - held until the process ends
+            if folder.exists() and not folder.is_dir():
+                raise BadInput(f"{name}: {folder} is a file")
+            if folder.exists() and set(os.listdir(folder)) - {"lock", "log.txt"} and not self.flags.resume:
+                raise BadInput(f"{name}: {folder} exists; go on with --resume, or choose another --name")
+            self._made = not folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = open(folder / "lock", "w")  # noqa: SIM115 - held until close
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            fail(f"--name {self.folder.name}: another process is running {self.folder}")
+            self._lock.close()
+            raise BadInput(f"{name}: another process is running {folder}") from None
         except OSError as error:
-            fail(f"--data_dir {self.folder.parent}: cannot write there ({error.strerror})")
+            raise BadInput(f"--data_dir {folder.parent}: cannot write {folder} ({error.strerror})") from None
         self.checkpoint = None
-        if (self.folder / "checkpoint.pt").exists():
-            try:
-                self.checkpoint = load_torch(self.folder / "checkpoint.pt")
-                self._same_run(config)
-            except ValueError as error:
-                fail(f"--resume: {error}")
-        self._files = {}
-        with self._whole():
-            for name, columns in (("episodes", EPISODES), ("progress", PROGRESS)):
-                path = self.folder / f"{name}.csv"
-                if self.checkpoint:
-                    size = self.checkpoint["log_bytes"][name]
+        try:
+            if (folder / "checkpoint.pt").exists():
+                self.checkpoint = load_torch(folder / "checkpoint.pt")
+                self._same_run()
+                self._log = json.loads(self.checkpoint["log"])
+                for table in self.columns:
+                    path, size = folder / f"{table}.csv", self.checkpoint["log_bytes"][table]
                     if not path.exists() or path.stat().st_size < size:
-                        fail(f"--resume: {path} is gone or shorter than its checkpoint says ({size} bytes)")
-                    os.truncate(path, size)  # rows after the checkpoint are made again
+                        raise BadInput(f"{path} is gone or shorter than its checkpoint says ({size} bytes)")
+        except BadInput as error:
+            self._lock.close()
+            raise BadInput(f"--resume: {error}") from None
+
+    def _same_run(self):
+        """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
+        free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
+                "eval_trials", "device", "quick", "variant"}  # fmt: skip
+        saved, path = self.checkpoint, self.folder / "checkpoint.pt"
+        parts = {"format", "config", "log", "log_bytes", "seconds"}
+        if not isinstance(saved, dict) or not parts <= set(saved) or saved["format"] != FORMAT:
+            raise BadInput(f"{path}: of another version of this code; begin a new --name")
+        before, now = json.loads(saved["config"]), json.loads(json.dumps(self._config))
+        if before["algo"] != now["algo"]:
+            raise BadInput(f"{path}: a run of {before['algo']}, not of {now['algo']}")
+        for key in sorted(set(now) | set(before)):
+            if key not in free and now.get(key) != before.get(key):
+                raise BadInput(f"{path}: made with --{key} {before.get(key)}, not {now.get(key)}")
+        if self._fixed_length and now["epochs"] != before["epochs"]:
+            raise BadInput(f"{path}: made with --epochs {before['epochs']}, not {now['epochs']}, and learning rates "
+                           "that fall over its length; begin a new --name")  # fmt: skip
+        path = self.folder / "config.json"
+        try:
+            self._recorded = json.loads(path.read_text())
+            self._recorded["versions"], self._recorded["epochs"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise BadInput(f"{path}: a run's settings as JSON are expected ({one_line(error)})") from None
+
+    def __enter__(self):
+        if threading.current_thread() is threading.main_thread():  # elsewhere Python has no signals
+            self._handlers = {number: signal.signal(number, self._asked_to_stop) for number in STOP_SIGNALS}
+        else:
+            self._handlers = {}
+        return self
+
+    def _asked_to_stop(self, number, frame):
+        self.stop_signals.append(number)
+        if not self._files:  # nothing has begun that could be saved
+            raise KeyboardInterrupt
+
+    def __exit__(self, kind, error, trace):
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        if self._bar:
+            self._bar.close()
+        for file in self._files.values():
+            file.close()
+        if self._board:
+            self._board.close()
+        if not self._files and self._made and not self.checkpoint:  # stopped before anything was written
+            with contextlib.suppress(OSError):
+                (self.folder / "lock").unlink()
+                self.folder.rmdir()
+        self._lock.close()
+
+    def finished(self):
+        """Whether the checkpoint is of a run's end; says so."""
+        done = bool(self.checkpoint) and self.checkpoint["t"] >= self.total_steps
+        if done:
+            print(f"{self.folder}: finished, {self.checkpoint['t']} steps; more with --epochs, a new run with --name")
+        return done
+
+    def begin(self, demo_env_steps=0):
+        """Writes config.json, opens the curves, cut back to the checkpoint, and says what comes."""
+        start = 0
+        if self.checkpoint:
+            start = self.checkpoint["t"]
+        else:
+            self._log["demo_env_steps"] = demo_env_steps
+            if self.flags.resume and not self.flags.quiet:
+                print(f"{self.folder}: no checkpoint there, so this begins a new run")
+        with self._or_say_so():
+            for table, columns in self.columns.items():
+                path = self.folder / f"{table}.csv"
+                if self.checkpoint:
+                    os.truncate(path, self.checkpoint["log_bytes"][table])  # rows after the checkpoint are made again
                 else:
                     path.write_text(",".join(columns) + "\n")
-                self._files[name] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
-            self._write_config(config)
-        self.seconds_before = self.checkpoint["seconds"] if self.checkpoint else 0.0
-        self._begin = time.monotonic()
-        self._board = SummaryWriter(self.folder) if tensorboard else None
+                self._files[table] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
+            self._write_config()
+        self._seconds = self.checkpoint["seconds"] if self.checkpoint else 0.0
+        self._since = time.monotonic()
+        if self.flags.tensorboard:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(self.folder)
+        quiet = self.flags.quiet
+        self._bar = tqdm(total=self.total_steps, initial=start, unit="step", smoothing=0.02, mininterval=1,
+                         disable=quiet or None)  # fmt: skip
+        self._shown = ["eval_success", "epoch", "env_steps", "EpRet", "Success", "EpLen"]
+        self._shown += [c for c in self.columns["progress"][len(PROGRESS):-2] if c not in ("L_O", "L_C", "L_A")]
+        self._say(f"{self.folder}: {self.total_steps:,} steps, {self._log['demo_env_steps']:,} of the demonstrator")
+        heads = {"eval_success": "test %", "Success": "train %", "env_steps": "steps"}
+        self._say(" ".join(f"{heads.get(c, c):>{max(7, len(c))}}" for c in self._shown))
+
+    def _say(self, text):
+        if not self.flags.quiet:
+            self._bar.write(text)
+
+    def _write_config(self):
+        """config.json: the flags, the command and the versions; those of a resume too, where they are others."""
+        made_with = versions()
+        text = self._config | {"command": sys.argv, "versions": made_with}
+        if self.checkpoint:
+            before = self._recorded
+            text = (text if self._config["epochs"] > before["epochs"] else before) | {"versions": before["versions"]}
+            resumed = before.get("resumed_with", [])
+            if made_with != [before["versions"], *resumed][-1]:
+                text["resumed_with"] = [*resumed, made_with]
+        atomic_write(self.folder / "config.json", json.dumps(text, indent=1, default=str))
 
     @contextlib.contextmanager
-    def _whole(self):
+    def _or_say_so(self):
         """Around what writes: a full disk ends the run with 2 and one line; what was saved before stays as it is."""
         try:
             yield
         except (OSError, RuntimeError) as error:  # torch.save turns the one into the other
-            print(f"{Path(sys.argv[0]).name}: error: --data_dir {self.folder.parent}: cannot write {self.folder} "
-                  f"({one_line(error)}); go on from its last checkpoint with --resume", file=sys.stderr)  # fmt: skip
-            sys.stderr.flush()
-            os._exit(2)  # the curves' files would try to write once more
+            for file in self._files.values():  # their buffers would be written once more, and fail once more
+                with contextlib.suppress(OSError):
+                    file.close()
+            raise BadInput(f"--data_dir {self.folder.parent}: cannot write {self.folder} ({one_line(error)}); "
+                           "go on from its last checkpoint with --resume") from None  # fmt: skip
 
-    def _write_config(self, config):
-        """config.json: the flags, the command and the versions; those of a resume too, where they are others."""
-        path, made_with = self.folder / "config.json", versions()
-        text = config | {"command": sys.argv, "versions": made_with}
-        if self.checkpoint:
-            before = self._config
-            text = (text if config["epochs"] > before["epochs"] else before) | {"versions": before["versions"]}
-            resumed = before.get("resumed_with", [])
-            if made_with != [before["versions"], *resumed][-1]:
-                text["resumed_with"] = [*resumed, made_with]
-        atomic_write(path, lambda file: file.write(json.dumps(text, indent=1).encode()))
+    def _write(self, table, row):
+        """Appends a row (dict by column; None and NaN are left blank)."""
+        values = [row.get(column) for column in self.columns[table]]
+        texts = ["" if v is None or v != v else f"{v:.9g}" if isinstance(v, float) else v for v in values]
+        with self._or_say_so():
+            csv.writer(self._files[table], lineterminator="\n").writerow(texts)
 
-    def _same_run(self, config):
-        """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
-        free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
-                "eval_trials", "device"}  # fmt: skip
-        path, parts = self.folder / "checkpoint.pt", {"config", "log_bytes", "seconds"}
-        made_with = self.checkpoint if isinstance(self.checkpoint, dict) else {}
-        if made_with.get("format", 1) != FORMAT or not parts <= set(made_with):
-            raise ValueError(f"{path}: of another version of this code; begin a new --name")
-        before = json.loads(made_with["config"])
-        if before.get("algo") != config.get("algo"):
-            raise ValueError(f"{path}: a run of {before.get('algo')}, not of {config.get('algo')}")
-        for key in sorted(set(config) | set(before)):
-            if key not in free and json.dumps(config.get(key)) != json.dumps(before.get(key)):
-                raise ValueError(f"{path}: made with --{key} {before.get(key)}, not {config.get(key)}")
-        path = self.folder / "config.json"
-        try:
-            self._config = json.loads(path.read_text())
-            self._config["versions"], self._config["epochs"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: a run's settings as JSON are expected ({one_line(error)})") from None
+    def log_episode(self, env_steps, info):
+        """One line of episodes.csv. env_steps: after it; info: of its last step."""
+        self._log["episodes"] += 1
+        episode = info["episode"]
+        self._write("episodes", {
+            "episode": self._log["episodes"], "env_steps": env_steps, "return": episode["r"], "length": episode["l"],
+            "success": int(info["is_success"]), "collision": info["collision"],
+        })  # fmt: skip
+        self._log["epoch_episodes"].append([episode["r"], episode["l"], int(info["is_success"])])
+        self._bar.update(env_steps - self._bar.n)
+
+    def log_updates(self, measured):
+        """Floats by name, of one or more updates; the epoch's line has their mean. Raises NotFinite."""
+        for name in ("L_A", "L_C"):
+            if measured[name] is not None and not math.isfinite(measured[name]):
+                raise NotFinite(f"{self.folder}: {name} is {measured[name]}; go on from its last checkpoint with "
+                                "--resume, or begin anew with smaller learning rates")  # fmt: skip
+        self._log["epoch_updates"].append(measured)
+
+    def log_epoch(self, env_steps, evaluation):
+        """One line of progress.csv and of the table. evaluation: {"eval_success", "eval_return"} or {}."""
+        row = {"epoch": env_steps // self.flags.steps_per_epoch, "env_steps": env_steps,
+               "demo_env_steps": self._log["demo_env_steps"], "seconds": self.seconds()}  # fmt: skip
+        if episodes := self._log["epoch_episodes"]:
+            row |= zip(("EpRet", "EpLen", "Success"), np.mean(episodes, axis=0).tolist(), strict=True)
+        for name in self._log["epoch_updates"][0] if self._log["epoch_updates"] else ():
+            known = [m[name] for m in self._log["epoch_updates"] if m[name] is not None]
+            row[name] = float(np.mean(known)) if known else None
+        self._log["epoch_episodes"], self._log["epoch_updates"] = [], []
+        row |= evaluation
+        self._write("progress", row)
+        percent = {name: 100 * row[name] for name in ("eval_success", "Success") if name in row}
+        cells = [(row | percent).get(c) for c in self._shown]
+        self._say(" ".join(f"{'–' if v is None else f'{v:.4g}' if isinstance(v, float) else v:>{max(7, len(c))}}"
+                           for c, v in zip(self._shown, cells, strict=True)))  # fmt: skip
+        self._bar.update(env_steps - self._bar.n)
+        for column, v in row.items() if self._board else ():
+            if v is not None:
+                self._board.add_scalar(column, v, env_steps)
 
     def seconds(self):
         """Wall-clock seconds of the run, earlier parts included."""
-        return self.seconds_before + time.monotonic() - self._begin
+        return self._seconds + time.monotonic() - self._since
 
-    def write(self, name, row):
-        """Appends a row (dict by column; None and NaN are left blank) to "episodes" or "progress"."""
-        columns = EPISODES if name == "episodes" else PROGRESS
-        values = [row.get(column) for column in columns]
-        with self._whole():
-            csv.writer(self._files[name], lineterminator="\n").writerow(
-                ["" if v is None or v != v else f"{v:.9g}" if isinstance(v, float) else v for v in values]
-            )
-        if self._board and name == "progress":
-            for column, v in zip(columns, values, strict=True):
-                if v is not None:
-                    self._board.add_scalar(column, v, row["env_steps"])
-
-    def save(self, state, config, policy):
+    def save(self, state, policy):
         """Writes checkpoint.pt, `state` (tensors and plain types) and what a resume needs of the folder itself, and
-        policy.pt."""
+        policy.pt (see evaluate.Policy)."""
         import torch
 
-        with self._whole():
+        with self._or_say_so():
             sizes = {}
-            for name, file in self._files.items():
+            for table, file in self._files.items():
                 file.flush()
                 os.fsync(file.fileno())
-                sizes[name] = os.fstat(file.fileno()).st_size
-            state = state | {"log_bytes": sizes, "seconds": self.seconds(), "config": json.dumps(config)}
-            state["format"] = FORMAT
+                sizes[table] = os.fstat(file.fileno()).st_size
+            state = state | {"log_bytes": sizes, "log": json.dumps(self._log), "seconds": self.seconds(),
+                             "config": json.dumps(self._config, default=str), "format": FORMAT}  # fmt: skip
             atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))
             atomic_write(self.folder / "policy.pt", lambda file: torch.save(policy, file))
