@@ -259,7 +259,9 @@ def versions():
 
 class Replayable(gymnasium.Wrapper):
     """An environment whose unfinished episode fits into a checkpoint: as the random state it began with and the actions
-    since, which are played again (PyBullet's state is not enough to go on exactly). At its end info["episode"] holds
+    since, which are played again (PyBullet's state is not enough to go on exactly).
+
+    `episode` holds the steps since reset, (s, a, r, s2, terminated, truncated) each. At its end info["episode"] holds
     the return "r" and the length "l", as with gymnasium's RecordEpisodeStatistics."""
 
     def __init__(self, env, seed):
@@ -268,27 +270,28 @@ class Replayable(gymnasium.Wrapper):
 
     def reset(self, *, seed=None, options=None):
         self._began = self.unwrapped.np_random.bit_generator.state
-        self._actions, self._return = [], 0.0
-        return self.env.reset(seed=seed, options=options)
+        self._s, info = self.env.reset(seed=seed, options=options)
+        self.episode = []
+        return self._s, info
 
     def step(self, action):
-        s, r, terminated, truncated, info = self.env.step(action)
-        self._actions.append(action)
-        self._return += r
+        s2, r, terminated, truncated, info = self.env.step(action)
+        self.episode.append((self._s, action, r, s2, terminated, truncated))
+        self._s = s2
         if terminated or truncated:
-            info["episode"] = {"r": self._return, "l": len(self._actions)}
-        return s, r, terminated, truncated, info
+            info["episode"] = {"r": sum(step[2] for step in self.episode), "l": len(self.episode)}
+        return s2, r, terminated, truncated, info
 
     def state(self):
-        return {"began": json.dumps(self._began), "actions": [a.tolist() for a in self._actions]}
+        return {"began": json.dumps(self._began), "actions": [step[1].tolist() for step in self.episode]}
 
     def load(self, state):
         """Plays the episode of `state` again. Returns the observation it had come to."""
         self.unwrapped.np_random.bit_generator.state = json.loads(state["began"])
-        s, _ = self.reset()
+        self.reset()
         for a in state["actions"]:
-            s, *_ = self.step(np.array(a, dtype=np.float32))
-        return s
+            self.step(np.array(a, dtype=np.float32))
+        return self._s
 
 
 # ---- a run's folder --------------------------------------------------------------------------------------------------
@@ -314,7 +317,7 @@ class RunFolder:
             try:
                 import torch.utils.tensorboard  # noqa: F401
             except ImportError:
-                raise BadInput("--tensorboard: the tensorboard package is not installed (pip install tensorboard)") from None
+                raise BadInput("--tensorboard: needs the tensorboard package (pip install tensorboard)") from None
         self._take()
 
     def _take(self):
