@@ -1,14 +1,14 @@
-"""General Abstract Symmetry (`sec:envs`): what stays the same when the world is turned about the robot's base axis.
+"""General Abstract Symmetry (Sec. 3.1): what stays the same when the world is turned about the robot's base axis.
 
-    phi(obs, k, K=4)      the state map: the world turned by k * 2*pi/K           (eq:st_p2p_phi)
-    psi(action, k, K=4)   the action map: the identity, joint velocities stay     (sec:envs)
+    phi(obs, k, K=4)      the state map: the world turned by k * 2*pi/K           (Eq. 4)
+    psi(action, k, K=4)   the action map: the identity, joint velocities stay     (Sec. 3.1)
     rotate(obs, angle)    the state map at any angle: the symmetry does not stop at K
     canonical(obs)        the world turned so that q_1 = 0: the state in the arm's own frame
-    partition_of(obs, K)  which sector S_k the TCP is in                          (def:sps)
-    aggregate(demos, K)   one partition's demonstrations, turned into all K       (sec:demo)
+    partition_of(obs, K)  which sector S_k the TCP is in                          (Definition 2)
+    aggregate(demos, K)   one partition's demonstrations, turned into all K       (Sec. 3.2)
 
 The maps take numpy arrays or torch tensors of any leading shape and return the same type, dtype and device.
-Differs from the printed eq:st_p2p_phi: P_g (and P_o) rotate too, else R(s, a) = R(phi(s), psi(a)) does not hold; and
+Differs from the printed Eq. 4: P_g (and P_o) rotate too, else R(s, a) = R(phi(s), psi(a)) does not hold; and
 q_1 goes down where the world turns up, because joint 1 points down.
 """
 
@@ -16,30 +16,21 @@ import math
 
 import numpy as np
 
-from kinova_env import OBSERVATION, TASKS, wrap
+from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-
-def _index(layout):
-    """{how it rotates: [first index, ...]} of an observation layout."""
-    index, i = {}, 0
-    for _, width, rotates in layout:
-        index.setdefault(rotates, []).append(i)
-        i += width
-    return i, index
-
-
-_INDEX = dict(_index(layout) for layout in OBSERVATION.values())  # by observation width: 22 or 25
-_SECTOR_START = {_index(OBSERVATION[task])[0]: row.sector_start for task, row in TASKS.items()}
-_P_G = _E = 0
-for _name, _width, _ in OBSERVATION["p2p"]:
-    _P_G, _E = (_P_G + _width * (_name not in ("P_g", "e")), _E + _width * (_name != "e"))
+# By observation width, 22 or 25: {how it rotates: [first index, ...]} and the row of a task of that width.
+_ROTATES, _TASK = {}, {}
+for _task, _layout in OBSERVATION.items():
+    _ROTATES[OBS_DIM[_task]], _TASK[OBS_DIM[_task]] = {}, _task
+    for _name, _, _how in _layout:
+        _ROTATES[OBS_DIM[_task]].setdefault(_how, []).append(INDEX[_task][_name].start)
 
 
 def _library(obs):
     """(array library, copy of obs, its rotation index); raises ValueError on a width that no task has."""
-    if obs.shape[-1] not in _INDEX:
-        raise ValueError(f"observation of width {obs.shape[-1]}: must be one of {sorted(_INDEX)}")
-    index = _INDEX[obs.shape[-1]]
+    if obs.shape[-1] not in _ROTATES:
+        raise ValueError(f"observation of width {obs.shape[-1]}: must be one of {sorted(_ROTATES)}")
+    index = _ROTATES[obs.shape[-1]]
     if isinstance(obs, np.ndarray):
         return np, obs.copy(), index
     import torch
@@ -48,7 +39,7 @@ def _library(obs):
 
 
 def rotate(obs, angle):
-    """The state with the world turned by `angle` rad about the base axis (`eq:st_p2p_phi` at any angle).
+    """The state with the world turned by `angle` rad about the base axis (Eq. 4 at any angle).
 
     obs: (..., 22 or 25) as KinovaEnv returns; angle: a number, or an array that broadcasts to obs.shape[:-1].
     Returns the same type, shape and dtype. Exact but for the rounding of the dtype (float32: 4e-7).
@@ -66,7 +57,7 @@ def rotate(obs, angle):
 
 
 def phi(obs, k, K=4):
-    """State map onto the partition k places further round (`eq:st_p2p_phi`): the world turned by k * 2*pi/K.
+    """State map onto the partition k places further round (Eq. 4): the world turned by k * 2*pi/K.
 
     obs: (..., 22 or 25). phi_0 is the identity, bit for bit, and phi_a of phi_b is phi_(a+b mod K).
     """
@@ -75,7 +66,7 @@ def phi(obs, k, K=4):
 
 
 def psi(action, k, K=4):
-    """Action map (`sec:envs`): the identity. action: (..., 4) joint velocities, the same in a turned world."""
+    """Action map (Sec. 3.1): the identity. action: (..., 4) joint velocities, the same in a turned world."""
     return action
 
 
@@ -93,19 +84,20 @@ def canonical(obs):
 
 
 def partition_of(obs, K=4):
-    """Number k of the sector S_k (`def:sps`) that holds the TCP: (...) whole numbers in 0 ... K-1.
+    """Number k of the sector S_k (Definition 2) that holds the TCP: (...) whole numbers in 0 ... K-1.
 
     Sectors are 2*pi/K wide and centred on their demonstration start angle.
     """
     xp, _, _ = _library(obs)
-    tcp = obs[..., _P_G : _P_G + 3] - obs[..., _E : _E + 3]
-    theta = xp.arctan2(tcp[..., 1], tcp[..., 0])
-    k = xp.floor(theta / (2 * math.pi / K) - _SECTOR_START[obs.shape[-1]] + 0.5) % K
+    task = _TASK[obs.shape[-1]]
+    P_e = obs[..., INDEX[task]["P_g"]] - obs[..., INDEX[task]["e"]]
+    theta = xp.arctan2(P_e[..., 1], P_e[..., 0])
+    k = xp.floor(theta / (2 * math.pi / K) - TASKS[task].sector_start + 0.5) % K
     return k.astype(np.int64) if xp is np else k.long()
 
 
 def aggregate(demos, K=4, num_demos=None):
-    """Demonstrations of partition 0, mapped to all K (`sec:demo`): each episode, then its K - 1 images.
+    """Demonstrations of partition 0, mapped to all K (Sec. 3.2): each episode, then its K - 1 images.
 
     demos: the arrays of `pid_demo.record` (rows: obs, act, rew, obs2, terminated, truncated, episode; one entry an
     episode: partition, success, length, return); other partitions' episodes are left out. Returns the same arrays
@@ -117,12 +109,12 @@ def aggregate(demos, K=4, num_demos=None):
     total = len(sources) * K if num_demos is None else min(num_demos, len(sources) * K)
     for n in range(total):
         source, k = sources[n // K], n % K
-        mine = demos["episode"] == source
+        of_source = demos["episode"] == source
         for name in set(demos) - {"partition"}:
-            images[name].append(demos[name][mine] if name in rows else demos[name][source : source + 1])
+            images[name].append(demos[name][of_source] if name in rows else demos[name][source : source + 1])
         images["obs"][-1], images["obs2"][-1] = phi(images["obs"][-1], k, K), phi(images["obs2"][-1], k, K)
         for name in {"act", "executed"} & set(demos):
             images[name][-1] = psi(images[name][-1], k, K)
-        images["episode"][-1] = np.full(mine.sum(), n, dtype=demos["episode"].dtype)
+        images["episode"][-1] = np.full(of_source.sum(), n, dtype=demos["episode"].dtype)
         images["partition"].append(np.full(1, k, dtype=demos["partition"].dtype))
     return {name: np.concatenate(parts) if parts else demos[name][:0] for name, parts in images.items()}

@@ -1,4 +1,4 @@
-"""The Kinova Gen3 environment of Demo-EASE in PyBullet: reach, reach past an obstacle, pick and place (`sec:exp`).
+"""The Kinova Gen3 environment of Demo-EASE in PyBullet: reach, reach past an obstacle, pick and place (Sec. 4).
 
     import gymnasium, kinova_env
     env = gymnasium.make("KinovaP2P-v0", stage="train")           # or KinovaP2PO-v0, KinovaPnP-v0
@@ -30,24 +30,27 @@ URDF = Path(__file__).parent / "data" / "robot" / "gen3_2f85.urdf"
 
 @dataclass(frozen=True)
 class Task:
-    """One row of the task table (`sec:exp`). Angles in rad, lengths in m."""
+    """One row of the task table (Sec. 4). Angles in rad, lengths in m."""
 
     env_id: str
-    horizon: int  # T, steps (tab:reward, tab:reward2)
+    horizon: int  # T, steps (Tables 1 and 2)
     speed: float  # fraction of the joint velocity limits that |a| = 1 asks for
     cube: str  # "" (none), "obstacle" (P2P-O) or "object" (P&P)
     sector_start: float  # demonstration start angle, in units of 2*pi/K from the sector's number k
     test_theta: float  # start angle of the test study
-    return_max: float  # largest possible return: R1, on P&P R1 + R3
+    return_min: float  # no return is smaller: see TASKS
+    return_max: float  # largest possible return: R_1, on P&P R_1 + R_3
 
 
+# return_min: -R_2 for a collision, and P2P's worst 400 steps of distance (under 1.75 m) and effort (under 0.7), -3.7.
+# On the longer tasks it bounds the discounted return: at gamma = 0.99, -R_2 and 100 such steps, -2.5.
 TASKS = {
-    "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4, 10.0),
-    "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2, 10.0),
-    "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2, 12.0),
+    "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4, -4.0, 10.0),
+    "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2, -4.0, 10.0),
+    "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2, -4.0, 12.0),
 }
 
-# The observation, eq:st_p2p: (name, width, how it changes when the world is rotated about the base axis).
+# The observation, Eq. 2: (name, width, how it changes when the world is rotated about the base axis).
 _STATE = [
     ("q", 4, "angle"),  # the first entry shifts
     ("sin q", 4, "sine"),  # the sine of that first entry
@@ -61,11 +64,21 @@ OBSERVATION = {
     "p2po": _STATE + [("P_o", 3, "vector")],
     "pnp": _STATE + [("P_o", 3, "vector")],
 }
+OBS_DIM = {task: sum(width for _, width, _ in layout) for task, layout in OBSERVATION.items()}
+INDEX = {}  # INDEX[task][name]: the slice of the observation
+for _task, _layout in OBSERVATION.items():
+    _ends = np.cumsum([width for _, width, _ in _layout]).tolist()
+    INDEX[_task] = {name: slice(end - width, end) for (name, width, _), end in zip(_layout, _ends, strict=True)}
 
 # No entry leaves [-bound, bound]: the arm reaches 1.33 m, and 20 rad/s is far beyond what its motors can do.
 BOUND = {"q": math.pi, "sin q": 1.0, "cos q": 1.0, "q_dot": 20.0, "P_g": 2.0, "e": 4.0, "P_o": 2.0}
 
-# Reward, sec:def_reward, and the grasp rule.
+# Where goals are drawn, radius and height in m (Eq. 10): on train and test, and on demo.
+RHO, Z = (0.3, 0.7), (0.25, 0.65)
+RHO_DEMO, Z_DEMO = (0.4, 0.6), (0.35, 0.55)
+CUBE_DRAWS = 200  # of a P&P cube for one goal
+
+# Reward, Eq. 11, and the grasp rule.
 ALPHA_1, ALPHA_2 = 2e-3, 1e-3
 R_1, R_2, R_3 = 10.0, 2.0, 2.0
 EPSILON = 0.05  # m
@@ -138,8 +151,29 @@ def grasp_postures(cube):
 
 def grasped(obs):
     """Whether the cube is in the gripper, P_o = P_e, in P&P observations (..., 25), numpy or torch. Returns (...)."""
-    P_g, e, P_o = obs[..., 16:19], obs[..., 19:22], obs[..., 22:25]
+    P_g, e, P_o = (obs[..., INDEX["pnp"][name]] for name in ("P_g", "e", "P_o"))
     return ((P_o - P_g + e) ** 2).sum(-1) < 1e-6  # 1 mm
+
+
+def relabel(task, s, r, s2, goal):
+    """The same steps of P2P or P2P-O towards another goal (hindsight, Andrychowicz et al. 2017).
+
+    s, s2: (n, OBS_DIM) raw observations before and after; r: (n,) rewards; goal: (3,) or (n, 3) in m. Returns
+    (s, r, s2, success (n,) bool): P_g and e are the new goal's, and so are the distance and reaching terms of Eq. 11;
+    effort and collision stay. Raises ValueError on P&P, where the way to the cube does not depend on the goal.
+    """
+    if TASKS[task].cube == "object":
+        raise ValueError(f"task {task!r}: only steps of p2p and p2po can be given another goal")
+    P_g, e = INDEX[task]["P_g"], INDEX[task]["e"]
+    s, s2 = s.copy(), s2.copy()
+    before = np.linalg.norm(s2[:, e], axis=1)
+    for obs in (s, s2):
+        obs[:, e] += goal - obs[:, P_g]
+        obs[:, P_g] = goal
+    distance = np.linalg.norm(s2[:, e], axis=1)
+    success = distance < EPSILON
+    reached = r > R_1 / 2  # the step was a success
+    return s, r - ALPHA_1 * (distance - before) + R_1 * (success.astype(float) - reached), s2, success
 
 
 def start_posture(theta, rho, z):
@@ -183,7 +217,7 @@ class KinovaEnv(gymnasium.Env):
     | 3 | Actuator5 | 1.22 | 9 |
 
     ## Observation space
-    `Box(-bound, bound, (22,), float32)`, (25,) with a cube (`eq:st_p2p`):
+    `Box(-bound, bound, (22,), float32)`, (25,) with a cube (Eq. 2); `INDEX[task][name]` is a slice:
 
     | index | name | unit | bound | meaning |
     |---|---|---|---|---|
@@ -196,7 +230,7 @@ class KinovaEnv(gymnasium.Env):
     | 22-24 | P_o | m | 2 | cube (P2P-O and P&P); moves with the gripper once grasped |
 
     ## Rewards
-    The sum of five terms (`sec:def_reward`), each in `info["reward_terms"]`:
+    The sum of five terms (Eq. 11), each in `info["reward_terms"]`:
 
     | term | value |
     |---|---|
@@ -218,9 +252,11 @@ class KinovaEnv(gymnasium.Env):
     | test | -pi/4 (P2P) or -pi/2, 0.5, 0.45 | as train |
     | demo | the start of sector k of K, 0.52, 0.42, each joint +- 0.02 rad | in the sector, [0.4, 0.6), [0.35, 0.55) |
 
-    The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. Draws that start in
-    collision or at the goal, and P&P cubes that cannot be grasped, are drawn again. On stage "demo" the goals of tasks
-    with a cube lie in the sector's clockwise half, and P&P cubes in the sector.
+    The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. On stage "demo" the
+    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube that cannot
+    be grasped, or lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in
+    collision or at the goal is drawn again whole. So is a P&P goal for which 200 cubes will not do: 0 of 20,000 goals
+    on each stage (of the lowest goals' cubes 60 % can be grasped), some where sectors are narrow (K > 10).
 
     ## Episode end
     Terminated: success (norm(e) < 0.05, on P&P with the cube grasped), or collision: `info["collision"]` is "self" for
@@ -305,43 +341,46 @@ class KinovaEnv(gymnasium.Env):
     # ---- sampling -------------------------------------------------------------------------------------------------
 
     def sector_start(self, partition):
-        """Start angle in rad of demonstration sector k, which is also the sector's centre (`sec:exp`)."""
+        """Start angle in rad of demonstration sector k, which is also the sector's centre (Sec. 4.1)."""
         return (partition + self.row.sector_start) * 2 * math.pi / self.partitions
 
     def _draw(self, options):
         """One draw of (start posture (4,), goal (3,), cube (3,) or None); explicit options are taken as they are."""
         uniform = self.np_random.uniform
-        low, high, z_low, z_high = (0.4, 0.6, 0.35, 0.55) if self.stage == "demo" else (0.3, 0.7, 0.25, 0.65)
-        width = 2 * math.pi / self.partitions
         if self.stage == "demo":
-            centre = self.sector_start(self.partition)
+            centre, half = self.sector_start(self.partition), math.pi / self.partitions
             start, jitter = (centre, 0.52, 0.42), uniform(-0.02, 0.02, 4)
-            theta = uniform(centre - width / 2, centre + (0 if self.row.cube else width / 2))
+            theta = uniform(centre - half, centre + (0 if self.row.cube else half))
+            goal = (theta, uniform(*RHO_DEMO), uniform(*Z_DEMO))
         else:
             start = (math.pi / 4, 0.52, 0.42) if self.stage == "train" else (self.row.test_theta, 0.5, 0.45)
             jitter = 0.0
-            theta = uniform(-math.pi, math.pi)
-        goal = (theta, uniform(low, high), uniform(z_low, z_high))
+            goal = (uniform(-math.pi, math.pi), uniform(*RHO), uniform(*Z))
         if "start" in options:
             start, jitter = options["start"], 0.0
-        goal = options.get("goal", goal)
-        cube = None
-        if self.row.cube:
+        goal, cube = options.get("goal", goal), None
+        for _ in range(CUBE_DRAWS if self.row.cube else 0):
             side = self.np_random.choice([-1.0, 1.0])
-            theta_o = goal[0] + side * uniform(math.pi / 12, math.pi / 6)
-            cube = (theta_o, uniform(0.4, 0.6), uniform(goal[2] - 0.1, goal[2] + 0.1))
+            theta = goal[0] + side * uniform(math.pi / 12, math.pi / 6)
+            cube = (theta, uniform(0.4, 0.6), uniform(goal[2] - 0.1, goal[2] + 0.1))
             cube = options.get("object", cube)
+            if "object" in options or self._cube_fits(cube):
+                break
         return start_posture(*start) + jitter, goal, cube
 
-    def _playable(self, goal, cube):
-        """Whether a sampled episode may begin: not at the goal, no collision, and a P&P cube that can be grasped."""
-        if math.dist(tcp(self.q), cartesian(*goal)) < EPSILON or self._collision():
-            return False
-        if self.row.cube != "object":
+    def _cube_fits(self, cube):
+        """Whether a sampled P&P cube can be grasped and, on demo, lies in the sector; P2P-O's always fits."""
+        if self.row.cube == "obstacle":
             return True
         if self.stage == "demo" and abs(wrap(cube[0] - self.sector_start(self.partition))) > math.pi / self.partitions:
             return False
         return len(grasp_postures(cartesian(*cube))) > 0
+
+    def _playable(self, goal, cube):
+        """Whether a sampled episode may begin: not at the goal, no collision, and a cube that fits."""
+        if math.dist(tcp(self.q), cartesian(*goal)) < EPSILON or self._collision():
+            return False
+        return cube is None or self._cube_fits(cube)
 
     def _check_options(self, options):
         unknown = set(options) - {"partition", "start", "goal", "object"}
@@ -464,7 +503,7 @@ class KinovaEnv(gymnasium.Env):
                     self._move_cube(-self.q[0])
         success = distance < EPSILON and (self.grasped or self.row.cube != "object")
         collision = self._collision()
-        # sec:def_reward
+        # Eq. 11
         r_dst, r_eft = -ALPHA_1 * to_go, -ALPHA_2 * tau_hat
         r_rch, r_cls, r_grsp = R_1 * success, -R_2 * bool(collision), R_3 * first_grasp
         info = {
@@ -484,7 +523,7 @@ class KinovaEnv(gymnasium.Env):
         truncated = False
         if self.stage == "demo":
             outside = abs(wrap(math.atan2(y, x) - self.sector_start(self.partition)))
-            truncated = outside > math.pi / self.partitions  # left its sector: zeta of sec:demo
+            truncated = outside > math.pi / self.partitions  # left its sector: zeta of Sec. 3.2
             info["partition"] = self.partition
         if self.render_mode == "human":
             self._show()
