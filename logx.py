@@ -489,9 +489,10 @@ class RunFolder:
         self._bar.update(env_steps - self._bar.n)
 
     def log_updates(self, measured):
-        """Floats by name, of one or more updates; the epoch's line has their mean. Raises NotFinite."""
+        """Floats by name (NaN: not measured) of some updates; the epoch's line has their mean. Raises NotFinite where
+        L_C or L_A is not finite."""
         for name in ("L_A", "L_C"):
-            if measured[name] is not None and not math.isfinite(measured[name]):
+            if not math.isfinite(measured[name]):
                 raise NotFinite(f"{self.folder}: {name} is {measured[name]}; go on from its last checkpoint with "
                                 "--resume, or begin anew with smaller learning rates")  # fmt: skip
         self._log["epoch_updates"].append(measured)
@@ -503,7 +504,7 @@ class RunFolder:
         if episodes := self._log["epoch_episodes"]:
             row |= zip(("EpRet", "EpLen", "Success"), np.mean(episodes, axis=0).tolist(), strict=True)
         for name in self._log["epoch_updates"][0] if self._log["epoch_updates"] else ():
-            known = [m[name] for m in self._log["epoch_updates"] if m[name] is not None]
+            known = [m[name] for m in self._log["epoch_updates"] if not math.isnan(m[name])]
             row[name] = float(np.mean(known)) if known else None
         self._log["epoch_episodes"], self._log["epoch_updates"] = [], []
         row |= evaluation
