@@ -490,11 +490,10 @@ class RunFolder:
 
     def log_updates(self, measured):
         """Floats by name (NaN: not measured) of some updates; the epoch's line has their mean. Raises NotFinite where
-        L_C or L_A is not finite."""
-        for name in ("L_A", "L_C"):
-            if not math.isfinite(measured[name]):
-                raise NotFinite(f"{self.folder}: {name} is {measured[name]}; go on from its last checkpoint with "
-                                "--resume, or begin anew with smaller learning rates")  # fmt: skip
+        a loss is not finite."""
+        if not math.isfinite(measured["L_C"]) or math.isinf(measured["L_A"]):
+            raise NotFinite(f"{self.folder}: L_C is {measured['L_C']}, L_A {measured['L_A']}; go on from its last "
+                            "checkpoint with --resume, or begin anew with smaller learning rates")  # fmt: skip
         self._log["epoch_updates"].append(measured)
 
     def log_epoch(self, env_steps, evaluation):
