@@ -210,7 +210,7 @@ def demonstrations(flags):
     if found < flags.num_demos:
         raise ValueError(f"demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     first = demos["episode"] < flags.num_demos
-    columns = {"obs", "act", "executed", "rew", "obs2", "terminated", "episode"} & set(demos)
+    columns = {"obs", "act", "executed", "rew", "obs2", "terminated", "truncated", "episode"} & set(demos)
     return {name: demos[name][first] for name in columns}, meta["env_steps"]
 
 
