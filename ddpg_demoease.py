@@ -293,7 +293,7 @@ class Learner:
         self.mu, self.nu = list(self.net.mu.parameters()), list(self.net.nu.parameters())
         self.optimizer = torch.optim.Adam([dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)],
                                           fused=True)  # fmt: skip
-        self.move_target = get_ema_multi_avg_fn(f.polyak)
+        self.mu_nu_target, self.move_target = list(self.target.parameters()), get_ema_multi_avg_fn(f.polyak)
         self.actor = self.net.mu if f.device == "cpu" else deepcopy(self.net.mu).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
         self.conservative = f.conservative
@@ -337,20 +337,17 @@ class Learner:
         Q = net.Qs(s, a)
         L_C = loss_C(Q, y)
 
-        u = net.mu(s)
+        s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
+        u, u_demo = net.mu(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
+        a_hat = torch.tanh(u_demo)
         L_O = loss_O(net.Qs(s, torch.tanh(u))[0], f.normalize_q)
-        L_A = L_O
-        if B_d:
-            s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
-            u_demo = net.mu(s_demo)
-            a_hat = torch.tanh(u_demo)
-            with torch.set_grad_enabled(self.conservative > 0):
-                Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat.detach())
-            M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
-            L_BC = loss_BC(a_demo, a_hat, M)
-            L_A = loss_A(L_O, L_BC, f.lambda_bc)
-            if self.conservative:
-                L_C = L_C + self.conservative * loss_conservative(Q_demo, Q_own)
+        with torch.set_grad_enabled(self.conservative > 0):
+            Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat.detach())
+        M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
+        L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
+        L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
+        if self.conservative and B_d:
+            L_C = L_C + self.conservative * loss_conservative(Q_demo, Q_own)
 
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
@@ -360,17 +357,15 @@ class Learner:
         self.update_targets()
         if not measure:
             return None
-        none = L_A.new_full((), math.nan)
         return [x.detach() for x in (
-            L_O, L_BC if B_d else none, L_C, L_A, M.mean() if B_d else none, Q.mean(), Q.max(), u.abs().mean(),
-            u_demo.abs().mean() if B_d else none,
+            L_O, L_BC, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
             # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
-            ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum() if B_d else none,
+            ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
         )]  # fmt: skip
 
     def update_targets(self):
         """mu' <- omega mu' + (1 - omega) mu, and nu' alike."""
-        self.move_target(list(self.target.parameters()), list(self.net.parameters()), None)
+        self.move_target(self.mu_nu_target, [*self.mu, *self.nu], None)
 
     def clone(self, B_o, B_d):
         """Before the first step: clone_iters updates of the actor on B_d, M = 1, then of the critic, the actor held."""
