@@ -48,22 +48,23 @@ class Flags:
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 1; 5 T steps an epoch is ours: the paper does not say)
-    epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: see its task", low=1)
-    steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T", low=1)
+    epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 50", low=1)
+    steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T, robust p2p: 1000", low=1)
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 1; start_steps and update_after: ours)
     update_every: int | None = flag(None, "N_up, steps between blocks of as many updates; T/20", low=1)
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T, robust: 0", low=0)
     update_after: int | None = flag(None, "no updates before; T", low=0)
-    replay_size: int = flag(1_000_000, "N_o", low=1)
+    replay_size: int = flag(1_000_000, "N_o", low=1, high=10_000_000)
     batch_size: int = flag(100, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
     act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
     polyak: float | None = flag(None, "omega, target update coefficient; 0.995, robust: 0.98", low=0, high=1)
-    pi_lr: float | None = flag(None, "alpha_mu; 1e-3", low=0)
+    pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu", low=0)
-    hidden_sizes: tuple[int, ...] | None = flag(None, "p2p 128 512 128, p2po 256 1024 256, pnp 512 512 256", low=1)
+    hidden_sizes: tuple[int, ...] | None = flag(None, "p2p 128 512 128, p2po 256 1024 256, pnp 512 512 256", low=1,
+                                                high=10_000)  # fmt: skip
     mask: str = flag("q", "q: Eq. 8; none: M = 1", ("q", "none"))
     demos_in_B_o: bool = flag(True, "demonstrations go into B_o too (Sec. 3.3; Alg. 1 prints an empty B_o)")
     timeout_ends: bool = flag(False, "a timeout ends bootstrapping too (zeta as Sec. 3.2 prints it)")
@@ -72,15 +73,12 @@ class Flags:
                                     "with (pid_demo.record); 0, robust: 0.2", low=0)  # fmt: skip
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor with L_BC alone, then of the critic alone, before the "
-                                   "first step; 0", low=0)  # fmt: skip
-    hindsight: int | None = flag(None, "copies of each episode in B_o whose goal is a place it came to; 0", low=0)
-    critics: int | None = flag(None, "of which the smallest value counts; 1", low=1, high=2)
-    conservative: float | None = flag(None, "weight in L_C of loss_conservative at first; falls linearly to 0 over the "
-                                      "run's first quarter; 0, robust: 0.5", low=0)  # fmt: skip
+                                   "first step; 0, robust: 2500", low=0)  # fmt: skip
+    hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
+    critics: int | None = flag(None, "of which the smallest value counts; 1, robust: 2", low=1, high=2)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip targets to the range of possible returns")
-    normalize_q: bool | None = flag(None, "divide L_O by the detached |mean Q| of the batch")
     lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
@@ -102,19 +100,20 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; the paper trains pnp with PPO: its sizes
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
-             hindsight=0, critics=1, conservative=0.0, updates_per_step=1.0, critic_layernorm=False, clip_target=False,
-             normalize_q=False, lr_decay=False)  # fmt: skip
-ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=1e-3, demo_noise=0.2, n_step=10, clone_iters=0,
-              hindsight=0, critics=1, conservative=0.5, updates_per_step=0.25, critic_layernorm=True, clip_target=True,
-              normalize_q=True, lr_decay=True)  # fmt: skip
-ROBUST_EPOCHS = {"p2p": 50, "p2po": 80, "pnp": 50}
+             hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False, clip_target=False,
+             lr_decay=False)  # fmt: skip
+ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
+              hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True, clip_target=True,
+              lr_decay=True, start_steps=0)  # fmt: skip
+ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs=40),
+               "pnp": dict(epochs=50, hindsight=0)}  # another goal would not say where the cube is grasped
 
 
 def recipe_defaults(task, recipe, max_ep_len=None):
     """{flag: value} of all that task and recipe decide."""
-    defaults = TASK_DEFAULTS[task] | (PAPER if recipe == "paper" else ROBUST | {"epochs": ROBUST_EPOCHS[task]})
-    T = max_ep_len or defaults["max_ep_len"]
-    return defaults | dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
+    T = max_ep_len or TASK_DEFAULTS[task]["max_ep_len"]
+    schedule = dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
+    return TASK_DEFAULTS[task] | schedule | (PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task])
 
 
 def resolve(flags):
@@ -124,6 +123,8 @@ def resolve(flags):
     defaults = recipe_defaults(flags.task, flags.recipe, flags.max_ep_len)
     recipe = replace(Flags(task=flags.task, recipe=flags.recipe), **defaults)
     flags = replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
+    if flags.hindsight and flags.task == "pnp":
+        raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp")
     logx.name_run(flags, recipe, "ddpg")
     return flags
 
@@ -250,16 +251,9 @@ def loss_C(Q_s_a, y):
     return ((Q_s_a - y) ** 2).mean(-1).sum()
 
 
-def loss_conservative(Q_demo, Q_own):
-    """Where the critic holds the policy's action better than the demonstrated one, by how much (ours, after Kumar et
-    al., CQL, 2020)."""
-    return (Q_own - Q_demo).clamp(min=0).mean()
-
-
-def loss_O(Q_s_pi, normalize_q):
-    """Alg. 1; normalize_q (ours) keeps its scale, so that lambda_BC means the same throughout training."""
-    mean_Q = Q_s_pi.mean()
-    return -mean_Q / mean_Q.abs().detach().clamp(min=1e-3) if normalize_q else -mean_Q
+def loss_O(Q_s_pi):
+    """Alg. 1."""
+    return -Q_s_pi.mean()
 
 
 def mask(Q_demo, Q_own):
@@ -293,10 +287,9 @@ class Learner:
         self.mu, self.nu = list(self.net.mu.parameters()), list(self.net.nu.parameters())
         self.optimizer = torch.optim.Adam([dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)],
                                           fused=True)  # fmt: skip
-        self.mu_nu_target, self.move_target = list(self.target.parameters()), get_ema_multi_avg_fn(f.polyak)
+        self.target_parameters, self.move_targets = list(self.target.parameters()), get_ema_multi_avg_fn(f.polyak)
         self.actor = self.net.mu if f.device == "cpu" else deepcopy(self.net.mu).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
-        self.conservative = f.conservative
 
     @torch.inference_mode()
     def act(self, s):
@@ -307,15 +300,11 @@ class Learner:
             raise logx.NotFinite("the actor gives NaN; go on from the last checkpoint, or begin anew")
         return a
 
-    def schedule(self, remaining):
-        """Sets what falls over the run. remaining: the fraction of it that is still to come."""
+    def decay_learning_rates(self, remaining):
+        """Linearly to 0 over the second half of the run. remaining: the fraction of it that is still to come."""
         f = self.flags
-        first_quarter = max(0.0, (remaining - 0.75) / 0.25)
-        self.conservative = f.conservative * first_quarter
-        if f.lr_decay:
-            second_half = min(1.0, remaining / 0.5)
-            for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-                group["lr"] = lr * second_half
+        for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
+            group["lr"] = lr * min(1.0, remaining / 0.5)
 
     def updates(self, B_o, B_d, n):
         """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
@@ -325,7 +314,7 @@ class Learner:
             self.actor.load_state_dict(self.net.mu.state_dict())
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
-    def update(self, B_o, B_d, measure=False):
+    def update(self, B_o, B_d, measure=False, hold_actor=False):
         """One gradient step on a batch of B_o and one of B_d (None: no cloning). measure: returns MEASURED, tensors."""
         f, net, target = self.flags, self.net, self.target
         s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
@@ -340,21 +329,21 @@ class Learner:
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
         u, u_demo = net.mu(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
         a_hat = torch.tanh(u_demo)
-        L_O = loss_O(net.Qs(s, torch.tanh(u))[0], f.normalize_q)
-        with torch.set_grad_enabled(self.conservative > 0):
-            Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat.detach())
-        M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
+        L_O = loss_O(net.Qs(s, torch.tanh(u))[0])
+        with torch.no_grad():
+            Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat)
+            M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
-        if self.conservative and B_d:
-            L_C = L_C + self.conservative * loss_conservative(Q_demo, Q_own)
 
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
         L_C.backward()
-        L_A.backward(inputs=self.mu)
+        if not hold_actor:
+            L_A.backward(inputs=self.mu)
         self.optimizer.step()
-        self.update_targets()
+        # mu' <- omega mu' + (1 - omega) mu, and nu' alike
+        self.move_targets(self.target_parameters, [*self.mu, *self.nu], None)
         if not measure:
             return None
         return [x.detach() for x in (
@@ -363,29 +352,18 @@ class Learner:
             ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
         )]  # fmt: skip
 
-    def update_targets(self):
-        """mu' <- omega mu' + (1 - omega) mu, and nu' alike."""
-        self.move_target(self.mu_nu_target, [*self.mu, *self.nu], None)
-
     def clone(self, B_o, B_d):
-        """Before the first step: clone_iters updates of the actor on B_d, M = 1, then of the critic, the actor held."""
-        f, net, target = self.flags, self.net, self.target
+        """Before the first step: clone_iters updates of the actor on B_d with M = 1, then of the critic alone."""
+        f, net = self.flags, self.net
         for _ in range(f.clone_iters):
             s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a_demo, net.pi(s_demo), torch.ones_like(a_demo[:, 0]))
             self.optimizer.zero_grad()
             L_BC.backward()
             self.optimizer.step()
-        target.mu.load_state_dict(net.mu.state_dict())
+        self.target.mu.load_state_dict(net.mu.state_dict())
         for _ in range(f.clone_iters):
-            s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
-            with torch.no_grad():
-                y = r + discount * target.Q(s2, target.pi(s2))
-            L_C = loss_C(net.Qs(s, a), y.clamp(*self.return_range) if f.clip_target else y)
-            self.optimizer.zero_grad()
-            L_C.backward()
-            self.optimizer.step()
-            self.update_targets()
+            self.update(B_o, B_d, hold_actor=True)
 
     def state(self):
         return {"net": self.net.state_dict(), "target": self.target.state_dict(),
@@ -415,8 +393,7 @@ def train(flags):
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)
-    fixed_length = flags.lr_decay or flags.conservative > 0
-    with logx.RunFolder(flags, "ddpg", MEASURED, fixed_length) as run:
+    with logx.RunFolder(flags, "ddpg", MEASURED, fixed_length=flags.lr_decay) as run:
         if not run.finished():
             loop(flags, run)
     return run.folder
@@ -443,7 +420,10 @@ def loop(f, run):
     else:
         t, (s, _) = 0, env.reset()
         if demos:
-            B_d = ReplayBuffer(OBS_DIM[f.task], len(demos["rew"]), f.symmetry)
+            n = len(demos["rew"])
+            if f.demos_in_B_o and n > f.replay_size:
+                raise logx.BadInput(f"--replay_size {f.replay_size}: must hold the {n} demonstrated steps")
+            B_d = ReplayBuffer(OBS_DIM[f.task], n, f.symmetry)
             store_demonstrations(demos, B_o, B_d, f)
             learner.clone(B_o, B_d)
     run.begin(demo_env_steps)
@@ -476,7 +456,8 @@ def loop(f, run):
 
         # update
         if t >= f.update_after and t % f.update_every == 0 and B_o.filled:
-            learner.schedule(remaining=1 - t / run.total_steps)
+            if f.lr_decay:
+                learner.decay_learning_rates(remaining=1 - t / run.total_steps)
             n = math.floor(f.updates_per_step * t) - math.floor(f.updates_per_step * (t - f.update_every))
             if n:
                 run.log_updates(learner.updates(B_o, B_d, n))
