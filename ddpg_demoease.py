@@ -125,6 +125,9 @@ def resolve(flags):
     flags = replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp")
+    if flags.clone_iters and not flags.demos_in_B_o:
+        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: its critic learns from the demonstrations in B_o; 0 is "
+                            "allowed with --no-demos_in_B_o")  # fmt: skip
     logx.name_run(flags, recipe, "ddpg")
     return flags
 
