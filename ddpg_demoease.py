@@ -126,8 +126,8 @@ def resolve(flags):
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp")
     if flags.clone_iters and not flags.demos_in_B_o:
-        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: its critic learns from the demonstrations in B_o; 0 is "
-                            "allowed with --no-demos_in_B_o")  # fmt: skip
+        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: its critic learns from the demonstrations in B_o; "
+                            "with --no-demos_in_B_o 0 is allowed")  # fmt: skip
     logx.name_run(flags, recipe, "ddpg")
     return flags
 
