@@ -40,9 +40,7 @@ class Flags:
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
-    symmetry: str | None = flag(None, "none; gas: demonstrations of one partition mapped to K (paper); so2: samples "
-                                "turned by random angles; canonical: the networks see the arm's own frame (robust)",
-                                ("none", "gas", "so2", "canonical"))  # fmt: skip
+    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: canonical", ("none", "gas", "so2", "canonical"))
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
@@ -63,17 +61,14 @@ class Flags:
     polyak: float | None = flag(None, "omega, target update coefficient; 0.995, robust: 0.98", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu", low=0)
-    hidden_sizes: tuple[int, ...] | None = flag(None, "p2p 128 512 128, p2po 256 1024 256, pnp 512 512 256", low=1,
-                                                high=10_000)  # fmt: skip
+    hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
     mask: str = flag("q", "q: Eq. 8; none: M = 1", ("q", "none"))
     demos_in_B_o: bool = flag(True, "demonstrations go into B_o too (Sec. 3.3; Alg. 1 prints an empty B_o)")
     timeout_ends: bool = flag(False, "a timeout ends bootstrapping too (zeta as Sec. 3.2 prints it)")
     # the parts of the robust recipe (ours)
-    demo_noise: float | None = flag(None, "standard deviation of noise on the actions that demonstrations are recorded "
-                                    "with (pid_demo.record); 0, robust: 0.2", low=0)  # fmt: skip
+    demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
-    clone_iters: int | None = flag(None, "updates of the actor with L_BC alone, then of the critic alone, before the "
-                                   "first step; 0, robust: 2500", low=0)  # fmt: skip
+    clone_iters: int | None = flag(None, "updates of actor, then critic, before the first step; 0, robust: 2500", low=0)
     hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
     critics: int | None = flag(None, "of which the smallest value counts; 1, robust: 2", low=1, high=2)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
@@ -118,17 +113,13 @@ def recipe_defaults(task, recipe, max_ep_len=None):
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
-    logx.check_flags(flags)
-    flags = replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper"))
-    defaults = recipe_defaults(flags.task, flags.recipe, flags.max_ep_len)
-    recipe = replace(Flags(task=flags.task, recipe=flags.recipe), **defaults)
-    flags = replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
+    flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
+    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len), "ddpg")
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp")
     if flags.clone_iters and not flags.demos_in_B_o:
         raise logx.BadInput(f"--clone_iters {flags.clone_iters}: its critic learns from the demonstrations in B_o; "
                             "with --no-demos_in_B_o 0 is allowed")  # fmt: skip
-    logx.name_run(flags, recipe, "ddpg")
     return flags
 
 

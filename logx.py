@@ -174,10 +174,14 @@ NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed",
                  "variant"}  # fmt: skip
 
 
-def name_run(flags, recipe, algo):
-    """Fills in flags.variant, what differs from `recipe` (the recipe's own flags), and the name where there is none.
+def fill_in(flags, defaults, algo):
+    """A copy of the flags with `defaults`, {flag: value} of task and recipe, in place of None, with a name where there
+    is none, and with `variant`, what differs from the recipe.
 
     Raises BadInput where the name is no folder's or the device is not here."""
+    recipe = dataclasses.replace(type(flags)(task=flags.task, recipe=flags.recipe), **defaults)
+    given = {key: getattr(flags, key) for key in defaults}
+    flags = dataclasses.replace(flags, **{key: defaults[key] for key, value in given.items() if value is None})
     changed = {key: value for key, value in dataclasses.asdict(flags).items()
                if key not in NOT_A_VARIANT and value != getattr(recipe, key)}  # fmt: skip
     if flags.demos is not None:  # what they were recorded with is said by the file, not by these flags
@@ -199,6 +203,7 @@ def name_run(flags, recipe, algo):
 
         if not torch.cuda.is_available():
             raise BadInput("--device cuda: torch sees no GPU here; use --device cpu")
+    return flags
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

@@ -39,9 +39,7 @@ class Flags:
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
-    symmetry: str | None = flag(None, "none; gas: demonstrations of one partition mapped to K (paper); so2: samples "
-                                "turned by random angles; canonical: the networks see the arm's own frame (robust)",
-                                ("none", "gas", "so2", "canonical"))  # fmt: skip
+    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: canonical", ("none", "gas", "so2", "canonical"))
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
@@ -51,8 +49,7 @@ class Flags:
     steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1, high=10_000_000)
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
-    demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch until B_d is full; N_demos / 5, "
-                                       "robust: N_demos", low=1)  # fmt: skip
+    demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch; N_demos / 5, robust: N_demos", low=1)
     train_iters: int | None = flag(None, "N_up, updates an epoch; 20, robust: 80", low=1)
     batch_size: int = flag(800, "of B_o", low=1)
     demo_batch_size: int | None = flag(None, "of B_d; 100, robust: 256", low=1)
@@ -63,20 +60,16 @@ class Flags:
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
-    hidden_sizes: tuple[int, ...] | None = flag(None, "p2p 128 512 128, p2po 256 1024 256, pnp 512 512 256", low=1)
+    hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
     mask: str | None = flag(None, "reward: V(s) < R(s, a), Eq. 9; return: V(s) < the demonstrated reward-to-go; "
                             "none: M = 1 (robust)", ("reward", "return", "none"))  # fmt: skip
     demos_in_B_o: bool | None = flag(None, "demonstrations go into B_o too (Alg. 2); robust: no")
     # the parts of the robust recipe (ours)
-    demo_noise: float | None = flag(None, "standard deviation of noise on the actions that demonstrations are recorded "
-                                    "with (pid_demo.record); 0, robust: 0.2", low=0)  # fmt: skip
-    clone_iters: int | None = flag(None, "updates with L_BC and L_C on B_d alone before the first step; 0, robust: "
-                                   "4000", low=0)  # fmt: skip
-    after_kl: str | None = flag(None, "what goes on for the rest of an epoch once D_KL has reached target_kl: "
-                                "none, critic: L_C (robust), all: L_BC and L_C", ("none", "critic", "all"))  # fmt: skip
+    demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
+    clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 4000", low=0)
+    after_kl: str | None = flag(None, "what goes on past target_kl; robust: critic", ("none", "critic", "all"))
     normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d")
-    grasp_input: bool | None = flag(None, "the networks are told, as one more input, whether the cube is grasped "
-                                    "(P_o = P_e); pnp only")  # fmt: skip
+    grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; pnp only")
     clip_value: bool | None = flag(None, "clip V to the range of possible returns")
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
@@ -115,17 +108,13 @@ def recipe_defaults(task, recipe, num_demos=None):
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
-    logx.check_flags(flags)
-    flags = replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper"))
-    defaults = recipe_defaults(flags.task, flags.recipe, flags.num_demos)
-    recipe = replace(Flags(task=flags.task, recipe=flags.recipe), **defaults)
-    flags = replace(flags, **{key: value for key, value in defaults.items() if getattr(flags, key) is None})
+    flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
+    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.num_demos), "ppo")
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
     if flags.demos_in_B_o and flags.demo_noise and flags.demos is None:
         raise logx.BadInput("--demos_in_B_o: B_o would not hold what was done where demonstrations are recorded with "
                             "noise; use --no-demos_in_B_o or --demo_noise 0")  # fmt: skip
-    logx.name_run(flags, recipe, "ppo")
     return flags
 
 
