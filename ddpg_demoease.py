@@ -1,10 +1,10 @@
 """Off-policy Demo-EASE (Alg. 1): DDPG with demonstrations and masked cloning.
 
-    python ddpg_demoease.py --task p2p --recipe robust         # learns in minutes
+    python ddpg_demoease.py --task p2p --recipe robust      # learns in minutes
     python ddpg_demoease.py --task p2po --recipe robust
-    python ddpg_demoease.py --task p2p                         # as published
-    python ddpg_demoease.py --num_demos 0 --lambda_bc 0        # plain DDPG
-    python ddpg_demoease.py --seed 1 --resume                  # where it stopped
+    python ddpg_demoease.py --task p2p                      # as published
+    python ddpg_demoease.py --num_demos 0 --lambda_bc 0     # plain DDPG
+    python ddpg_demoease.py --seed 1 --resume               # where it stopped
 
 `--recipe paper`, the default, is the algorithm as published (Table 1), 500,000
 steps on P2P. `--recipe robust` adds a few parts, each a flag of its own, and
@@ -78,7 +78,7 @@ class Flags:
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
-    resume: bool | str = flag(False, "go on from the checkpoint, if there is one", metavar="FOLDER")
+    resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
     device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
     eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
     eval_trials: int = flag(50, "how many of them", low=1)
@@ -113,6 +113,7 @@ def recipe_defaults(task, recipe, max_ep_len=None):
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
+    flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len), "ddpg")
     if flags.hindsight and flags.task == "pnp":

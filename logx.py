@@ -174,6 +174,25 @@ NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed",
                  "variant"}  # fmt: skip
 
 
+def recorded(flags):
+    """With --resume FOLDER, the flags that the run there was begun with, and what else was asked for now; else the
+    flags as they are. Raises BadInput where the folder holds no run of this script."""
+    if not isinstance(flags.resume, str):
+        return flags
+    file = Path(flags.resume) / "config.json"
+    try:
+        config = json.loads(file.read_text())
+        fields = {field.name: field.default for field in dataclasses.fields(flags)}
+        before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
+        if missing := set(fields) - set(before):
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+    except (OSError, ValueError, AttributeError) as error:
+        raise BadInput(f"--resume {flags.resume}: must be a run's folder; {file} is none ({one_line(error)})") from None
+    asked = {name: v for name, v in dataclasses.asdict(flags).items() if v != fields[name]}
+    where = {"name": file.parent.resolve().name, "data_dir": str(file.parent.parent), "resume": True}
+    return dataclasses.replace(flags, **(before | asked | where))
+
+
 def fill_in(flags, defaults, algo):
     """A copy of the flags with `defaults`, {flag: value} of task and recipe, in place of None, with a name where there
     is none, and with `variant`, what differs from the recipe.
@@ -188,7 +207,8 @@ def fill_in(flags, defaults, algo):
         flags.gains = flags.demo_noise = None
         changed = {key: value for key, value in changed.items() if key not in ("gains", "demo_noise")}
         changed["demos"] = Path(flags.demos).name
-    variant = "-".join(f"{k}={v}" for k, v in changed.items()).replace(" ", "").replace("/", "_")
+    texts = {k: "x".join(map(str, v)) if isinstance(v, (tuple, list)) else str(v) for k, v in changed.items()}
+    variant = "-".join(f"{k}={v}" for k, v in texts.items()).replace(" ", "").replace("/", "_")
     flags.variant = variant if len(variant) <= 80 else f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
     if flags.name is None:
         length = f"epochs={flags.epochs}" if flags.epochs != recipe.epochs else ""

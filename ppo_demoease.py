@@ -1,9 +1,9 @@
 """On-policy Demo-EASE (Alg. 2): PPO-Clip with demonstrations, masked cloning.
 
-    python ppo_demoease.py --recipe robust            # P&P, learns in minutes
-    python ppo_demoease.py                            # as published
-    python ppo_demoease.py --num_demos 0 --lambda_bc 0                # plain PPO
-    python ppo_demoease.py --seed 1 --resume               # where it stopped
+    python ppo_demoease.py --recipe robust                  # learns in minutes
+    python ppo_demoease.py                                  # as published
+    python ppo_demoease.py --num_demos 0 --lambda_bc 0      # plain PPO
+    python ppo_demoease.py --seed 1 --resume                # where it stopped
 
 `--recipe paper`, the default, is the algorithm as published (Table 2); where
 table and algorithm are silent, the values are Spinning Up's. `--recipe robust`
@@ -74,7 +74,7 @@ class Flags:
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
-    resume: bool | str = flag(False, "go on from the checkpoint, if there is one", metavar="FOLDER")
+    resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
     device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
     eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
     eval_trials: int = flag(50, "how many of them", low=1)
@@ -108,6 +108,7 @@ def recipe_defaults(task, recipe, num_demos=None):
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
+    flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.num_demos), "ppo")
     if flags.grasp_input and flags.task != "pnp":
