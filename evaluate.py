@@ -1,17 +1,25 @@
-"""The test study (`Test Study`): trials of a trained run, or of the PID, from the test start pose.
+"""The test study (Sec. 5.2): watch trained agents, and measure them.
 
-    python evaluate.py data/runs/NAME --trials 500 --jobs 2        # prints the table, writes NAME/evaluation.csv
-    python evaluate.py data/runs/NAME --gif agent.gif --show 0 7   # trials 0 and 7; or --watch, in a window
-    python evaluate.py data/runs/NAME --versus data/runs/OTHER     # the paired difference on the same trials
-    python evaluate.py --pid --task p2p --gains fast --trials 500
+    python evaluate.py --list                           # the trained agents here
+    python evaluate.py data/results/NAME --gif agent.gif          # film one, or
+    python evaluate.py data/results/NAME --watch                  # in a window
+    python evaluate.py data/runs/NAME --trials 500 --jobs 2       # measure it
+    python evaluate.py data/runs/NAME --versus data/runs/OTHER    # the same trials
+    python evaluate.py --pid --task p2p --gains fast              # the PID
 
-P_scs: successful trials; over the successful ones T_eff: 100 * mean norm(tau_hat) / 2, in percent of the largest
-possible; R_test: mean return; E_95: mean norm(e) over the last 5 % of the steps, in cm. Trial i has the same goal for
-every agent, and nothing depends on the number of jobs.
+Measuring prints a table and writes NAME/evaluation.csv, one row a trial. With
+--first_trial, --start or --horizon it is another study, written to a file of
+its own: NAME/evaluation-horizon_600.csv.
+
+P_scs: successful trials, percent. Over the successful ones: T_eff (Eq. 12),
+100 * mean norm(tau_hat) / 2, percent of the largest possible; R_test, mean
+return; E_95 (Eq. 13), mean norm(e) over the last 5 % of the steps, cm. Trial i
+has the same goal for every agent, start and horizon.
 """
 
-import argparse
+import contextlib
 import csv
+import gzip
 import importlib.util
 import io
 import json
@@ -19,23 +27,50 @@ import math
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium
 import numpy as np
-import torch
 from tqdm import tqdm
 
 import gas
 import logx
 import pid_demo
-from kinova_env import OBSERVATION, TASKS, grasped
+from kinova_env import OBS_DIM, TASKS, grasped, start_posture
+from logx import flag
 
-COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm"]
-COLUMNS += ["goal_theta", "goal_rho", "goal_z"]
-PATHS = 20  # trials whose TCP paths are kept
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
+VALIDATION = 10_000  # trials from here on are for choosing; 0 ... 499 are the published ones and choose nothing
+PATHS = 20  # trials whose TCP paths are kept
+COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm",
+           "goal_theta", "goal_rho", "goal_z"]  # fmt: skip
+OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length"}
+
+
+@dataclass
+class Flags:
+    runs: tuple[Path, ...] = flag((), "run folders, or their policy.pt", positional=True, metavar="RUN")
+    list: bool = flag(False, "print the trained agents in data/results and data/runs, and how to watch each")
+    pid: bool = flag(False, "the PID demonstrator too")
+    task: str | None = flag(None, "with --pid", choices=tuple(TASKS))
+    gains: str | None = flag(None, "with --pid; authors", choices=tuple(pid_demo.GAINS))
+    out: Path | None = flag(None, "with --pid: the folder that its trials are written to", metavar="FOLDER")
+    trials: int = flag(500, "how many", low=1)
+    first_trial: int = flag(0, f"number of the first; choose on trials from {VALIDATION} on", low=0)
+    start: tuple[float, float, float] | None = flag(None, "another start pose: rad, m, m", metavar=("THETA", "RHO", "Z"))
+    horizon: int | None = flag(None, "steps until a timeout; the task's T", low=1)
+    jobs: int = flag(1, "worker processes", low=1)
+    versus: Path | None = flag(None, "print the differences from this run too, over the same trials", metavar="RUN")
+    gif: Path | None = flag(None, "film trials instead, the agents side by side; FILE.gif, or FILE.mp4 (pip install "
+                            "imageio imageio-ffmpeg)", metavar="FILE")  # fmt: skip
+    watch: bool = flag(False, "trials in PyBullet's window instead")
+    show: tuple[int, ...] | None = flag(None, "numbers of the trials to film (the first 6) or watch (3)", low=0)
+
+
+# ---- policies --------------------------------------------------------------------------------------------------------
 
 
 class Policy:
@@ -46,11 +81,13 @@ class Policy:
     """
 
     def __init__(self, stored):
+        import torch  # here and below: seconds, which tables and figures are spared
+
         self.task = stored["task"]
         self.canonical = stored["symmetry"] == "canonical"
-        sizes = stored["sizes"]
         self.grasp_input = bool(stored.get("grasp_input"))
-        if (sizes[0] - self.grasp_input, sizes[-1]) != (sum(width for _, width, _ in OBSERVATION[self.task]), 4):
+        sizes = stored["sizes"]
+        if (sizes[0] - self.grasp_input, sizes[-1]) != (OBS_DIM[self.task], 4):
             raise ValueError(f"sizes {sizes} do not fit task {self.task}")
         layers = []
         with torch.device("meta"):  # draws no random numbers: a policy may be made in the middle of a run
@@ -61,6 +98,8 @@ class Policy:
         self.net = torch.nn.Sequential(net, torch.nn.Tanh() if stored["output"] == "tanh" else torch.nn.Identity())
 
     def __call__(self, obs):
+        import torch
+
         s = gas.canonical(obs) if self.canonical else obs
         if self.grasp_input:
             s = np.concatenate((s, np.float32(grasped(s))[..., None]), axis=-1)
@@ -68,21 +107,58 @@ class Policy:
             return np.clip(self.net(torch.from_numpy(s)).numpy(), -1, 1)
 
 
-def load_policy(run_folder):
-    """The policy of a run folder (its `policy.pt`). Raises ValueError with what is wrong with the file."""
-    path = Path(run_folder) / "policy.pt"
+def load_policy(run):
+    """The Policy of a run folder or of a `policy.pt`. Raises logx.BadInput with what is wrong with the file."""
+    path = Path(run) if Path(run).suffix == ".pt" else Path(run) / "policy.pt"
     stored = logx.load_torch(path)
     try:
         if not isinstance(stored, dict):
             raise TypeError(f"holds a {type(stored).__name__}")
         return Policy(stored)
     except (LookupError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a policy of ours ({logx.one_line(error)})") from None
+        raise logx.BadInput(f"{path}: not a policy of ours ({logx.one_line(error)})") from None
+
+
+# ---- trials ----------------------------------------------------------------------------------------------------------
+
+
+class OtherStart(gymnasium.Wrapper):
+    """Episodes from another start pose (theta, rho, z), towards the goal that their seed draws without it.
+
+    What is drawn again when a start collides is then the cube alone; a goal within reach of the start is kept."""
+
+    def __init__(self, env, start):
+        super().__init__(env)
+        self.start = start
+
+    def reset(self, *, seed=None, options=None):
+        self.env.reset(seed=seed)
+        x, y, z = self.unwrapped.goal
+        goal = (math.atan2(y, x), math.hypot(x, y), z)
+        return self.env.reset(seed=seed, options={"start": self.start, "goal": goal})
+
+
+def make_agent(task, source, start=None, horizon=None, **render):
+    """(test environment, act(obs)) of a source: a run folder or policy.pt, PID gains (a name or triple), or any
+    callable obs -> action. Raises logx.BadInput."""
+    make = dict(stage="test", max_episode_steps=horizon, disable_env_checker=True)
+    env = gymnasium.make(TASKS[task].env_id, **make, **render)
+    env = OtherStart(env, start) if start else env
+    if callable(source):
+        return env, source
+    if isinstance(source, tuple) or source in pid_demo.GAINS:
+        pid = pid_demo.PID(env, source)
+        return env, lambda s: pid.act()
+    policy = load_policy(source)
+    if policy.task != task:
+        raise logx.BadInput(f"{source}: a policy of task {policy.task}, not of {task}")
+    return env, policy
 
 
 def trial(env, act, i):
-    """Runs test trial i to its end. Returns its row of evaluation.csv (dict), ||e_t|| in m (length + 1,), the path of
-    the TCP in m (length + 1, 3), and where the goal and (NaN on P2P) the cube were at its start, in m (2, 3)."""
+    """Runs test trial i to its end. act: any obs -> action. Returns its row of evaluation.csv (dict), ||e_t|| in m
+    (length + 1,), the path of the TCP in m (length + 1, 3), and where the goal and (NaN on P2P) the cube were at its
+    start, in m (2, 3)."""
     s, info = env.reset(seed=FIRST_SEED + i)
     start = [tuple(env.unwrapped.goal), tuple(getattr(env.unwrapped, "cube", (math.nan,) * 3))]
     errors, path, total, effort, done = [info["distance"]], [env.unwrapped.tcp], 0.0, 0.0, False
@@ -93,266 +169,271 @@ def trial(env, act, i):
         path.append(env.unwrapped.tcp)
         done = terminated or truncated
     length = len(errors) - 1
-    last = max(1, math.ceil(0.05 * length))
+    last = -(-length // 20)  # 5 % of the steps, rounded up
     x, y, z = env.unwrapped.goal
-    row = {
-        "trial": i,
-        "success": int(info["is_success"]),
-        "failure": "" if info["is_success"] else info["collision"] or "timeout",
-        "grasped": int(info["grasped"]),
-        "length": length,
-        "return": total,
-        "effort_percent": 100 * effort / length / 2,  # norm(tau_hat) is at most sqrt(4) = 2
-        "final_error_cm": 100 * errors[-1],
-        "e95_cm": 100 * sum(errors[-last:]) / last,
-        "goal_theta": math.atan2(y, x),
-        "goal_rho": math.hypot(x, y),
-        "goal_z": z,
-    }
+    failure = "" if info["is_success"] else info["collision"] or "timeout"
+    row = {"trial": i, "success": int(info["is_success"]), "failure": failure, "grasped": int(info["grasped"]),
+           "length": length, "return": total, "effort_percent": 100 * effort / length / 2,  # norm(tau_hat) <= sqrt(4)
+           "final_error_cm": 100 * errors[-1], "e95_cm": 100 * sum(errors[-last:]) / last,
+           "goal_theta": math.atan2(y, x), "goal_rho": math.hypot(x, y), "goal_z": z}  # fmt: skip
     return row, np.array(errors, dtype=np.float32), np.array(path, dtype=np.float32), np.array(start)
 
 
-def make_agent(task, source, **render):
-    """(test environment, act(obs)) of a run folder, or of the PID where `source` is a name or triple of gains."""
-    env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True, **render)
-    if isinstance(source, Path):
-        return env, load_policy(source)
-    pid = pid_demo.PID(env, source)
-    return env, lambda s: pid.act()
-
-
-def _trials(job):
-    task, source, numbers = job
-    torch.set_num_threads(1)
-    env, act = make_agent(task, source)
-    done = []
-    for i in numbers:
-        done.append(trial(env, act, i))
+def _trials(numbers, task, source, start, horizon):
+    env, act = make_agent(task, source, start, horizon)
+    done = [trial(env, act, i) for i in numbers]
     env.close()
     return done
 
 
-def run_trials(task, source, trials=500, jobs=1, quiet=False):
-    """Test trials 0 ... trials-1. source: a run folder (Path) or PID gains. Returns the rows of evaluation.csv and the
-    arrays of trajectories.npz: `length`, `success` (trials,), `error` in m, every trial's length + 1 values one after
-    another, and of the first PATHS trials `tcp` in m, alike, `goal` and `object` as the trial began (n, 3)."""
-    chunks = [(task, source, list(range(i, min(i + 10, trials)))) for i in range(0, trials, 10)]
-    bar = dict(total=len(chunks), desc="trials / 10", disable=quiet or None, leave=False)
-    if jobs == 1:
-        parts = list(tqdm(map(_trials, chunks), **bar))
-    else:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            parts = list(tqdm(pool.map(_trials, chunks), **bar))
-    rows, errors, tcp, starts = zip(*(done for part in parts for done in part), strict=True)
+def run_trials(task, source, trials=500, first_trial=0, start=None, horizon=None, jobs=1, quiet=False):
+    """Test trials first_trial, first_trial + 1, ... of a source (see make_agent). start: (theta, rho, z) in rad, m, m;
+    jobs: processes, on which nothing depends; where there are several the source must pickle.
+
+    Returns the rows of evaluation.csv and the arrays of trajectories.npz: `length`, `success` (trials,), `error` in m,
+    every trial's length + 1 values one after another, and of the first PATHS trials `tcp` in m, alike, `goal` and
+    `object` as the trial began (n, 3). Raises logx.BadInput."""
+    chunks = [range(first_trial, first_trial + trials)[i : i + 10] for i in range(0, trials, 10)]
+    work = partial(_trials, task=task, source=source, start=start, horizon=horizon)
+    with ProcessPoolExecutor(jobs, get_context("spawn")) if jobs > 1 else contextlib.nullcontext() as pool:
+        parts = (pool.map if pool else map)(work, chunks)
+        bar = tqdm(parts, total=len(chunks), desc="trials / 10", disable=quiet or None, leave=False)
+        rows, errors, tcp, starts = zip(*(one for part in bar for one in part), strict=True)
     goal, cube = np.array(starts[:PATHS]).swapaxes(0, 1)
     trajectories = {"length": np.array([row["length"] for row in rows]), "error": np.concatenate(errors)}
     trajectories |= {"success": np.array([row["success"] for row in rows], dtype=bool)}
     return list(rows), trajectories | {"tcp": np.concatenate(tcp[:PATHS]), "goal": goal, "object": cube}
 
 
-def metrics(rows):
-    """The paper's test metrics (`Test Study`) of rows of evaluation.csv; NaN where no trial succeeded."""
-    won = [row for row in rows if row["success"]]
+def while_training(policy, flags):
+    """{"eval_success": fraction, "eval_return": mean} of flags.eval_trials validation trials of a stored policy (dict).
 
-    def mean(column):
-        return sum(row[column] for row in won) / len(won) if won else math.nan
-
-    return {
-        "P_scs_percent": 100 * len(won) / len(rows),
-        "T_eff": mean("effort_percent"),
-        "R_test": mean("return"),
-        "E_95_cm": mean("e95_cm"),
-        "steps": mean("length"),
-    }
+    In an environment of its own; changes no random state of the run that calls it."""
+    numbers = range(VALIDATION, VALIDATION + flags.eval_trials)
+    rows = [row for row, *_ in _trials(numbers, flags.task, Policy(policy), None, flags.max_ep_len)]
+    return {f"eval_{name}": float(column(rows, name).mean()) for name in ("success", "return")}
 
 
-def intervals(rows):
-    """95 % intervals (low, high) of `metrics`: Wilson's for P_scs, Student's for means over the successful trials."""
-    from scipy import stats  # a second, which a training run need not spend
-
-    n, m = sum(row["success"] for row in rows), metrics(rows)
-    low, high = stats.binomtest(n, len(rows)).proportion_ci(method="wilson")
-    found = {"P_scs_percent": (100 * low, 100 * high)}
-    for name, column in OF_SUCCESSFUL.items():
-        x = np.array([row[column] for row in rows if row["success"]])
-        half = stats.t.ppf(0.975, n - 1) * x.std(ddof=1) / math.sqrt(n) if n > 1 else math.nan
-        found[name] = (m[name] - half, m[name] + half)
-    return found
+# ---- metrics and their 95 % intervals --------------------------------------------------------------------------------
 
 
-def sectors(rows):
-    """Success in percent by the quarter of the workspace the goal is in, from -180 degrees on; NaN for none there."""
-    quarter = [int((row["goal_theta"] + math.pi) // (math.pi / 2)) % 4 for row in rows]
-    mine = [[row["success"] for row, q in zip(rows, quarter, strict=True) if q == k] for k in range(4)]
-    return [100 * sum(won) / len(won) if won else math.nan for won in mine]
+def column(trials, name):
+    """(n,) of a column of evaluation.csv. trials: a pandas DataFrame, or a list of rows (dict)."""
+    return np.array(trials[name] if hasattr(trials, "columns") else [row[name] for row in trials], dtype=float)
 
 
-def paired(rows, others):
-    """Differences rows - others on the same trials, {name: (mean, low, high)}, 95 % bootstrap intervals over trials:
-    success in percentage points over all trials, the other metrics over those that both agents succeeded in."""
+def metrics(trials):
+    """The test metrics (Sec. 5.2, Eq. 12, Eq. 13) of trials (see `column`); NaN where no trial succeeded."""
+    won = column(trials, "success") == 1
+    means = {m: float(column(trials, name)[won].mean()) if won.any() else math.nan for m, name in OF_SUCCESSFUL.items()}
+    return {"P_scs_percent": float(100 * won.mean())} | means
+
+
+def over_trials(trials):
+    """{metric: (low, high)} of one agent's trials: Wilson's for P_scs, Student's t over the successful ones else.
+
+    Says nothing of what another seed would reach."""
     from scipy import stats
 
-    pairs = list(zip(rows, others, strict=True))
-    both = [(a, b) for a, b in pairs if a["success"] and b["success"]]
-    differences = {"P_scs_percent": [100 * (a["success"] - b["success"]) for a, b in pairs]}
-    differences |= {name: [a[column] - b[column] for a, b in both] for name, column in OF_SUCCESSFUL.items()}
-    found = {}
-    for name, d in differences.items():
-        low = high = d[0] if d else math.nan
-        if len(set(d)) > 1:
-            resampled = stats.bootstrap((d,), np.mean, method="percentile", rng=np.random.default_rng(0))
-            low, high = resampled.confidence_interval
-        found[name] = (float(np.mean(d)) if d else math.nan, float(low), float(high))
-    return found
+    won = column(trials, "success") == 1
+    low, high = stats.binomtest(int(won.sum()), len(won)).proportion_ci(method="wilson")
+    found = {metric: over_seeds(column(trials, name)[won])[1:] for metric, name in OF_SUCCESSFUL.items()}
+    return {"P_scs_percent": (100 * low, 100 * high)} | found
+
+
+def over_seeds(values):
+    """(mean, low, high) of the mean of values (seeds,) by Student's t, which a bootstrap of so small samples does not
+    cover. NaN values (N/A) are left out; low and high are NaN of a single one."""
+    return _student(*_mean(values))
+
+
+def difference(a, b):
+    """(mean of a minus mean of b, low, high) of two groups of seeds by Welch's t; NaN as in over_seeds."""
+    (mean_a, var_a, df_a), (mean_b, var_b, df_b) = _mean(a), _mean(b)
+    variance = var_a + var_b
+    df = variance**2 / (var_a**2 / df_a + var_b**2 / df_b) if variance > 0 else 1
+    return _student(mean_a - mean_b, variance, df)
+
+
+def paired(trials, others):
+    """{metric: (mean, low, high)} of trials minus others, which must be the same trials, by Student's t over trials.
+
+    P_scs in percentage points over all of them, the other metrics over those that both agents succeeded in. Raises
+    ValueError where the trials are not the same."""
+    if not np.array_equal(column(trials, "trial"), column(others, "trial")):
+        raise ValueError("paired differences need the same trials of both agents")
+    success = column(trials, "success") - column(others, "success")
+    both = (success == 0) & (column(trials, "success") == 1)
+    found = {m: over_seeds((column(trials, c) - column(others, c))[both]) for m, c in OF_SUCCESSFUL.items()}
+    return {"P_scs_percent": over_seeds(100 * success)} | found
+
+
+def _mean(values):
+    """(mean, its variance, degrees of freedom) of the values that are not NaN."""
+    x = np.asarray(values, dtype=float)
+    x = x[~np.isnan(x)]
+    n = len(x)
+    return x.mean() if n else math.nan, x.var(ddof=1) / n if n > 1 else math.nan, n - 1
+
+
+def _student(mean, variance, df):
+    from scipy import stats  # a second, which a training run need not spend
+
+    half = stats.t.ppf(0.975, df) * math.sqrt(variance)
+    return float(mean), float(mean - half), float(mean + half)
+
+
+# ---- output ----------------------------------------------------------------------------------------------------------
+
+CELLS = {"P_scs_percent": ("P_scs %", 1, 21), "T_eff": ("T_eff %", 1, 19), "R_test": ("R_test", 2, 21),
+         "E_95_cm": ("E_95 cm", 2, 19), "steps": ("steps", 0, 0)}  # heading, decimals, width  # fmt: skip
 
 
 def print_table(results, versus=None):
-    """results: {name: rows of evaluation.csv}; versus: the name that the others are compared with."""
-    width = max(24, *(len(name) for name in results))
-    cell = "{:5.{d}f} [{:.{d}f}, {:.{d}f}]".format
-    print(f"{'agent':{width}} trials  {'P_scs %':21}{'T_eff':20}{'R_test':21}{'E_95 cm':19}{'steps':18}failures")
+    """results: {name: rows of evaluation.csv}; versus: the name that the others are compared with. 100 columns."""
+
+    def cells(found):
+        texts = []
+        for (_, d, width), (mean, low, high) in zip(CELLS.values(), found.values(), strict=True):
+            texts.append((f"{mean:.{d}f} [{low:.{d}f}, {high:.{d}f}]" if mean == mean else "N/A").ljust(width))
+        return "  " + " ".join(texts)
+
+    print("  " + " ".join(heading.ljust(width) for heading, _, width in CELLS.values()))
     for name, rows in results.items():
-        m, ends = metrics(rows), intervals(rows)
-        cells = [(cell(m[key], *ends[key], d=d) if math.isfinite(m[key]) else "  N/A").ljust(w) for key, d, w in CELLS]
-        how = [row["failure"] for row in rows if row["failure"]]
-        failures = ", ".join(f"{how.count(f)} {f}" for f in sorted(set(how))) or "none"
-        print(f"{name:{width}} {len(rows):6d}  {''.join(cells)}{failures}")
-    print("[ ]: 95 % interval over trials (P_scs: Wilson; the others over the successful trials: Student)\n")
-    print("success % by the goal's quarter, theta in degrees:   [-180, -90)    [-90, 0)     [0, 90)   [90, 180)")
-    for name, rows in results.items():
-        print(f"{name:{width}}".ljust(51) + "".join(f"{share:12.1f}" for share in sectors(rows)))
+        ends, how = over_trials(rows), [row["failure"] for row in rows if row["failure"]]
+        failures = ", ".join(f"{how.count(f)} {f}" for f in sorted(set(how))) or "no failure"
+        print(name, cells({m: (mean, *ends[m]) for m, mean in metrics(rows).items()}), sep="\n")
+        print(f"  {len(rows)} trials: {failures}")
     for name in results if versus else ():
         if name != versus:
-            print(f"\n{name} less {versus}, the same trials (95 % bootstrap interval over trials):")
-            for key, found in paired(results[name], results[versus]).items():
-                print(f"  {key:14}{cell(*found, d=2)}")
+            print(name, f"  minus {versus}, the same trials:", cells(paired(results[name], results[versus])), sep="\n")
+    print("[ ]: 95 % interval over trials: Wilson's of P_scs, else Student's t, over the successful trials")
 
 
-OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length"}
-CELLS = [("P_scs_percent", 1, 21), ("T_eff", 1, 20), ("R_test", 2, 21), ("E_95_cm", 2, 19), ("steps", 0, 18)]
+def study(task, first_trial=0, start=None, horizon=None):
+    """What a study's files are called by: "" for the one of Sec. 5.2, else what is not as there."""
+    parts = ["start_" + "_".join(f"{x:g}" for x in start)] if start else []
+    parts += [f"horizon_{horizon}"] if horizon not in (None, TASKS[task].horizon) else []
+    return "-".join(parts + ([f"first_trial_{first_trial}"] if first_trial else []))
 
 
-def write_csv(path, rows):
+def write(folder, rows, trajectories, what=""):
+    """evaluation.csv and trajectories.npz in `folder`, of another study `what` evaluation-<what>.csv; a published file
+    stays as it is."""
+    path = folder / f"evaluation{what and '-' + what}.csv"
+    if path.with_name(f"{path.name}.gz").exists():
+        print(f"{path}.gz: published, stays as it is")
+        return
     text = io.StringIO()
     table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     table.writeheader()
     table.writerows([{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows])
-    logx.atomic_write(path, lambda file: file.write(text.getvalue().encode()))
+    logx.atomic_write(path, text.getvalue())
+    if not what:
+        logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
 
 
-def write(folder, rows, trajectories):
-    """evaluation.csv and trajectories.npz in `folder`."""
-    write_csv(folder / "evaluation.csv", rows)
-    logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
-
-
-def show(agents, trials, path=None):
-    """Test trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
-    where it is None."""
-    mode = dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
-    made = {name: make_agent(*agent, **mode) for name, agent in agents.items()}
-    seeds = [FIRST_SEED + i for i in trials]
+def show(agents, numbers, path=None, **settings):
+    """Trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
+    where it is None. settings: start, horizon."""
+    settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
+    made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
-        pid_demo.film(made, path, seeds)
-        return
-    ((env, act),) = made.values()
-    for seed in seeds:
-        s, _ = env.reset(seed=seed)
-        done = False
-        while not done:
-            s, _, terminated, truncated, _ = env.step(act(s))
-            done = terminated or truncated
-    env.close()
+        pid_demo.film(made, path, [FIRST_SEED + i for i in numbers])
+        print(f"wrote {path}")
+    for i in () if path else numbers:
+        row, *_ = trial(*made[next(iter(made))], i)
+        print(f"trial {i}: {row['failure'] or 'success'} after {row['length']} steps")
+    for env, _ in made.values():
+        env.close()
+
+
+def after_training(folder, task, gains, quiet):
+    """The ending of --quick: 100 test trials of the run and of the PID, as a table and files, and agent.gif."""
+    gains = gains or "fast"
+    agents = {str(folder): folder, f"PID, {gains} gains": gains}
+    found = {name: run_trials(task, source, 100, quiet=quiet) for name, source in agents.items()}
+    write(folder, *found[str(folder)])
+    print_table({name: rows for name, (rows, _) in found.items()})
+    show({str(folder): (task, folder)}, range(6), folder / "agent.gif")
+
+
+def print_agents():
+    """Every policy.pt in data/results and data/runs, of this file's folder and of the present one."""
+    roots = dict.fromkeys((Path(__file__).resolve().parent, Path.cwd()))
+    for path in (path for root in roots for path in sorted(root.glob("data/r*/**/policy.pt"))):
+        config, tested = {}, "not tested"
+        with contextlib.suppress(OSError, ValueError):
+            config = json.loads((path.parent / "config.json").read_text())
+        for name, read in (("evaluation.csv", open), ("evaluation.csv.gz", gzip.open)):
+            with contextlib.suppress(FileNotFoundError), read(path.parent / name, "rt") as file:
+                success = [row["success"] == "1" for row in csv.DictReader(file)]
+                tested = f"{100 * np.mean(success):.1f} % of {len(success)} test trials"
+        print(*(config.get(key, "?") for key in ("task", "algo", "recipe")), f"- {tested}")
+        print(f"    python {sys.argv[0]} {os.path.relpath(path.parent)} --watch")
+    print("--watch needs a display; --gif agent.gif needs none")
+
+
+# ---- main ------------------------------------------------------------------------------------------------------------
+
+
+def check(flags):
+    """{name: (task, source)} of what the flags name. Raises logx.BadInput."""
+    gif, of_pid = flags.gif, flags.task or flags.gains or flags.out
+    no_video = not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg")))
+    for wrong, message in (
+        (not (flags.pid or flags.runs), "RUN: name run folders (--list prints some), or --pid --task T"),
+        (flags.pid and not flags.task, f"--pid: needs --task, one of {', '.join(TASKS)}"),
+        (of_pid and not flags.pid, f"--task, --gains, --out {of_pid}: go with --pid; a run has its own"),
+        (gif and gif.suffix not in (".gif", ".mp4"), f"--gif {gif}: must end in .gif or .mp4"),
+        (gif and (gif.is_dir() or not gif.absolute().parent.is_dir()), f"--gif {gif}: must be a file in a folder"),
+        (gif and gif.suffix == ".mp4" and no_video, f"--gif {gif}: needs pip install imageio imageio-ffmpeg"),
+        (gif and flags.watch, "--gif, --watch: one of them at a time"),
+        (flags.watch and len(flags.runs) + flags.pid + bool(flags.versus) > 1, "--watch: one agent at a time"),
+    ):
+        if wrong:
+            raise logx.BadInput(message)
+    if flags.start:
+        try:
+            start_posture(*flags.start)
+        except ValueError as error:
+            raise logx.BadInput(f"--{error}") from None
+    agents = {str(run): (load_policy(run).task, run) for run in [*flags.runs, flags.versus] if run}
+    if flags.pid:
+        agents[f"PID, {flags.gains or 'authors'} gains, {flags.task}"] = flags.task, flags.gains or "authors"
+    tasks = sorted({task for task, _ in agents.values()})
+    if len(tasks) > 1 and (flags.versus or gif):
+        raise logx.BadInput(f"--versus, --gif: the agents must be of one task, not {' and '.join(tasks)}")
+    return agents
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folders")
-    parser.add_argument("--pid", action="store_true", help="the PID demonstrator too")
-    parser.add_argument("--task", choices=TASKS, help="with --pid")
-    parser.add_argument("--gains", choices=pid_demo.GAINS, help="with --pid (authors)")
-    parser.add_argument("--out", type=logx.path, metavar="FOLDER", help="with --pid: where its trials are written")
-    parser.add_argument("--trials", type=int, default=500)
-    parser.add_argument("--jobs", type=int, default=1, help="worker processes")
-    parser.add_argument("--versus", type=Path, metavar="RUN", help="print paired differences from this run as well")
-    parser.add_argument("--gif", type=logx.path, metavar="FILE", help="film trials instead, the agents side by side")
-    parser.add_argument("--mp4", type=logx.path, metavar="FILE",
-                        help="the same as a video (pip install imageio imageio-ffmpeg)")  # fmt: skip
-    parser.add_argument("--watch", action="store_true", help="trials in PyBullet's window instead")
-    parser.add_argument("--show", type=int, nargs="+", metavar="I", help="which trials (0 ... 5; --watch: 0 1 2)")
-    flags = parser.parse_args()
-    for name in ("trials", "jobs"):
-        if getattr(flags, name) < 1:
-            parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
-    flags.show = flags.show or [*range(3 if flags.watch else 6)]
-    if min(flags.show) < 0:
-        parser.error(f"--show {min(flags.show)}: must be at least 0")
-    if not (flags.pid or flags.runs):
-        parser.error("RUN or --pid --task T: name run folders, or ask for the PID")
-    if flags.pid and not flags.task:
-        parser.error(f"--pid: needs --task, one of {', '.join(TASKS)}")
-    if flags.out and not flags.pid:
-        parser.error(f"--out {flags.out}: goes with --pid; a run's trials are written into its own folder")
-    for name in ("task", "gains"):
-        if getattr(flags, name) and not flags.pid:
-            parser.error(f"--{name} {getattr(flags, name)}: goes with --pid; a run says its own")
-    flags.gains = flags.gains or "authors"
-    film = flags.gif or flags.mp4
-    for name in ("gif", "mp4"):
-        if getattr(flags, name):
-            pid_demo.check_output(parser, name, getattr(flags, name), f".{name}")
-    if flags.mp4 and not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg"))):
-        parser.error("--mp4: needs imageio and imageio-ffmpeg (pip install imageio imageio-ffmpeg), or use --gif")
-    if bool(flags.gif) + bool(flags.mp4) + flags.watch > 1:
-        parser.error("--gif, --mp4, --watch: one of them at a time")
-    agents = {}
-    for folder in [*flags.runs, *([flags.versus] if flags.versus else [])]:
-        try:
-            agents[str(folder)] = (load_policy(folder).task, folder)
-        except ValueError as error:
-            parser.error(str(error))
-    if flags.pid:
-        agents[f"PID, {flags.gains} gains, {flags.task}"] = (flags.task, flags.gains)
-    if flags.watch and len(agents) > 1:
-        parser.error("--watch: one agent at a time")
-    tasks = sorted({task for task, _ in agents.values()})
-    if len(tasks) > 1 and (flags.versus or film):
-        parser.error(f"--versus, --gif, --mp4: the agents must be of one task, not {' and '.join(tasks)}")
-    if film or flags.watch:
-        try:
-            show(agents, flags.show, film)
-        except ValueError as error:
-            parser.error(str(error))
-        except OSError as error:
-            parser.error(f"{film}: cannot be written ({error.strerror or error})")
-        if film:
-            print(f"wrote {film}")
-        return
-    results = {}
-    for name, (task, source) in agents.items():
-        results[name], trajectories = run_trials(task, source, flags.trials, flags.jobs)
-        try:
-            if isinstance(source, Path) and (source / "evaluation.csv.gz").exists():
-                print(f"{name}: a published run, its files stay as they are")
-            elif isinstance(source, Path):
-                write(source, results[name], trajectories)
-            elif flags.out:
-                flags.out.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # small networks: more threads would wait for each other
+    flags = logx.parse_flags(Flags, __doc__)
+    if flags.list:
+        return print_agents()
+    agents, results = check(flags), {}
+    settings = dict(start=flags.start, horizon=flags.horizon)
+    try:
+        if flags.gif or flags.watch:
+            numbers = flags.show or [flags.first_trial + i for i in range(3 if flags.watch else 6)]
+            return show(agents, numbers, flags.gif, **settings)
+        for name, (task, source) in agents.items():
+            found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
+            folder = flags.out
+            if isinstance(source, Path):
+                folder = source.parent if source.suffix == ".pt" else source
+            elif folder and not (folder / "evaluation.csv.gz").exists():
+                folder.mkdir(parents=True, exist_ok=True)
                 config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
-                text = json.dumps(config, indent=1).encode()
-                logx.atomic_write(flags.out / "config.json", lambda file, text=text: file.write(text))
-                write(flags.out, results[name], trajectories)
-        except OSError as error:
-            parser.error(f"{name}: its trials cannot be written ({error.strerror})")
+                logx.atomic_write(folder / "config.json", json.dumps(config, indent=1))
+            results[name] = found[0]
+            if folder:
+                write(folder, *found, study(task, flags.first_trial, **settings))
+    except OSError as error:
+        raise logx.BadInput(f"{error.filename or flags.gif or name}: cannot be written ({error.strerror})") from None
     print_table(results, str(flags.versus) if flags.versus else None)
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
-    try:
-        main()
-    except KeyboardInterrupt:
-        sys.exit(130)
+    logx.run_script(main)
