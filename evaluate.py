@@ -60,7 +60,8 @@ class Flags:
     out: Path | None = flag(None, "with --pid: the folder that its trials are written to", metavar="FOLDER")
     trials: int = flag(500, "how many", low=1)
     first_trial: int = flag(0, f"number of the first; choose on trials from {VALIDATION} on", low=0)
-    start: tuple[float, float, float] | None = flag(None, "another start pose: rad, m, m", metavar=("THETA", "RHO", "Z"))
+    start: tuple[float, float, float] | None = flag(None, "another start pose, in rad, m, m",
+                                                    metavar=("THETA", "RHO", "Z"))  # fmt: skip
     horizon: int | None = flag(None, "steps until a timeout; the task's T", low=1)
     jobs: int = flag(1, "worker processes", low=1)
     versus: Path | None = flag(None, "print the differences from this run too, over the same trials", metavar="RUN")
@@ -112,8 +113,6 @@ def load_policy(run):
     path = Path(run) if Path(run).suffix == ".pt" else Path(run) / "policy.pt"
     stored = logx.load_torch(path)
     try:
-        if not isinstance(stored, dict):
-            raise TypeError(f"holds a {type(stored).__name__}")
         return Policy(stored)
     except (LookupError, RuntimeError, TypeError, ValueError) as error:
         raise logx.BadInput(f"{path}: not a policy of ours ({logx.one_line(error)})") from None
@@ -337,7 +336,10 @@ def show(agents, numbers, path=None, **settings):
     """Trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
     where it is None. settings: start, horizon."""
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
-    made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
+    try:
+        made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
+    except ValueError as error:  # no display
+        raise logx.BadInput(f"--watch: {logx.one_line(error)}") from None
     if path:
         pid_demo.film(made, path, [FIRST_SEED + i for i in numbers])
         print(f"wrote {path}")
@@ -360,8 +362,9 @@ def after_training(folder, task, gains, quiet):
 
 def print_agents():
     """Every policy.pt in data/results and data/runs, of this file's folder and of the present one."""
-    roots = dict.fromkeys((Path(__file__).resolve().parent, Path.cwd()))
-    for path in (path for root in roots for path in sorted(root.glob("data/r*/**/policy.pt"))):
+    data = dict.fromkeys(root / "data" for root in (Path(__file__).resolve().parent, Path.cwd()))
+    places = [folder / name for folder in data for name in ("results", "runs")]
+    for path in (path for place in places for path in sorted(place.glob("**/policy.pt"))):
         config, tested = {}, "not tested"
         with contextlib.suppress(OSError, ValueError):
             config = json.loads((path.parent / "config.json").read_text())

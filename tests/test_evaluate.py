@@ -1,63 +1,54 @@
-"""evaluate.py: trials by hand on a scripted environment, the same for every agent, and safe loading of policies."""
+"""evaluate.py: trials by hand on a scripted environment, the same for every agent; metrics, intervals, policies."""
 
 import csv
-import importlib.util
 import json
 import math
+import os
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy import stats
 
 import ddpg_demoease as ddpg
 import evaluate
 import gas
+import kinova_env
 import logx
-import pid_demo
-from kinova_env import TASKS
+from kinova_env import OBS_DIM, TASKS
 
 HEADER = "trial,success,failure,grasped,length,return,effort_percent,final_error_cm,e95_cm,goal_theta,goal_rho,goal_z"
+TRAIN_START = (math.pi / 4, 0.52, 0.42)
 
 
-class Object:
-    """Not a plain type."""
+def rest(s):
+    return np.zeros(4, np.float32)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in training and in evaluate's own processes: the same sums in the same order."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+def stored(task="p2p", symmetry="none", seed=0, **changes):
+    """What policy.pt holds of an untrained policy."""
+    sizes = [OBS_DIM[task] + bool(changes.get("grasp_input")), 16, 4]
+    generator = torch.Generator().manual_seed(seed)
+    weights = {name: torch.randn(shape, generator=generator) for name, shape in (
+        ("0.weight", (16, sizes[0])), ("0.bias", (16,)), ("2.weight", (4, 16)), ("2.bias", (4,)))}  # fmt: skip
+    return {"task": task, "symmetry": symmetry, "sizes": sizes, "output": "tanh", "weights": weights} | changes
 
 
-def learner(task="p2p", symmetry="none", seed=0):
-    """An untrained actor as a training run holds it."""
-    torch.manual_seed(seed)
-    flags = ddpg.complete(ddpg.Flags(task=task, symmetry=symmetry, hidden_sizes=(16, 16)))[0]
-    return ddpg.Learner(flags, 22 if task == "p2p" else 25)
-
-
-@pytest.fixture(scope="session")
-def run_folder(tmp_path_factory):
-    """A run folder with a policy.pt."""
-    folder = tmp_path_factory.mktemp("runs") / "a run"
-    folder.mkdir()
-    logx.atomic_write(folder / "policy.pt", lambda file: torch.save(learner().policy(), file))
-    return folder
-
-
-def saved(folder, stored):
+def saved(folder, policy):
     folder.mkdir(exist_ok=True)
-    logx.atomic_write(folder / "policy.pt", lambda file: torch.save(stored, file))
+    logx.atomic_write(folder / "policy.pt", lambda file: torch.save(policy, file))
     return folder
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    return saved(tmp_path / "a run", stored())
 
 
 # ---- one trial -------------------------------------------------------------------------------------------------------
@@ -105,79 +96,121 @@ def test_a_row_follows_by_hand():
     assert errors == pytest.approx([1.0] + [0.9 - 0.02 * t for t in range(n)])  # e_0 to e_T
     np.testing.assert_allclose(path, [(0, 0, 0)] + [(0.1 * t, 0, 0.5) for t in range(1, n + 1)], rtol=1e-6)
     assert [a[0] for a in env.actions] == list(range(n))  # act saw each state once, in order
+    assert env.seeds == [1_000_007]
 
 
-@pytest.mark.parametrize("n, last", [(1, 1), (19, 1), (20, 1), (21, 2), (100, 5), (400, 20)])
+@pytest.mark.parametrize("n, last", [(1, 1), (20, 1), (21, 2), (140, 7), (400, 20)])  # 0.05 * 140 > 7 in floats
 def test_e95_is_over_the_last_twentieth_of_the_steps_and_at_least_one(n, last):
     script = [(0.01 * (n - t), 0.0, 0.0) for t in range(n)]
-    row, *_ = evaluate.trial(Scripted(script, False), lambda s: 0, 0)
+    row, *_ = evaluate.trial(Scripted(script, False), rest, 0)
     assert row["e95_cm"] == pytest.approx(np.mean([k for k in range(1, last + 1)])) and row["length"] == n
 
 
 @pytest.mark.parametrize("terminated, last, failure", [
     (True, dict(is_success=True), ""),
     (True, dict(collision="cube"), "cube"),
-    (True, dict(collision="self", grasped=True), "self"),
     (False, dict(), "timeout"),
-    (False, dict(is_success=True), ""),
     (True, dict(is_success=True, collision="cube"), ""),
 ])  # fmt: skip
 def test_a_failure_is_named_by_what_ended_the_trial(terminated, last, failure):
-    row, *_ = evaluate.trial(Scripted([(0.1, 0, 0), (0.1, 0, 0)], terminated, **last), lambda s: 0, 0)
+    row, *_ = evaluate.trial(Scripted([(0.1, 0, 0), (0.1, 0, 0)], terminated, **last), rest, 0)
     assert row["failure"] == failure and row["success"] == int(failure == "")
-    assert row["grasped"] == int(last.get("grasped", False))
-
-
-def test_trials_are_seeded_by_their_number_far_from_training_seeds():
-    env = Scripted([(0.1, 0, 0)], False)
-    for i in (0, 1, 499):
-        evaluate.trial(env, lambda s: 0, i)
-    assert env.seeds == [1_000_000, 1_000_001, 1_000_499]
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_trial_i_is_the_same_goal_for_every_agent_and_after_any_other_trial(task):
-    env = gymnasium.make(TASKS[task].env_id, stage="test", disable_env_checker=True, max_episode_steps=40)
-    pid = pid_demo.PID(env, "fast")
-    agents = {"rest": lambda s: np.zeros(4, np.float32), "PID": lambda s: pid.act(),
-              "down": lambda s: np.array([0, 1, 1, 0], np.float32)}  # fmt: skip
-    rows = {name: [evaluate.trial(env, act, i)[0] for i in (0, 1, 2)] for name, act in agents.items()}
-    goals = {name: [(r["goal_theta"], r["goal_rho"], r["goal_z"]) for r in trials] for name, trials in rows.items()}
-    assert goals["rest"] == goals["PID"] == goals["down"] and len(set(goals["rest"])) == 3
-    assert [evaluate.trial(env, agents["PID"], i)[0] for i in (2, 0)] == [rows["PID"][2], rows["PID"][0]]
-    env.close()
 
 
 # ---- many trials -----------------------------------------------------------------------------------------------------
 
 
-def test_nothing_depends_on_the_number_of_jobs(run_folder):
-    one, two = (evaluate.run_trials("p2p", run_folder, trials=11, jobs=jobs, quiet=True) for jobs in (1, 2))
-    assert one[0] == two[0] and [row["trial"] for row in one[0]] == list(range(11))
+@pytest.mark.parametrize("task", TASKS)
+def test_trial_i_has_the_same_goal_for_every_agent_start_and_horizon_and_after_any_other(task):
+    def goals(source, numbers=(0, 1, 2), **settings):
+        found = [evaluate.run_trials(task, source, 1, i, quiet=True, **settings)[0][0] for i in numbers]
+        return np.array([[row[f"goal_{name}"] for name in ("theta", "rho", "z")] for row in found])
+
+    first = goals(rest, horizon=5)
+    assert len(np.unique(first[:, 0])) == 3
+    np.testing.assert_array_equal(goals("fast", horizon=9), first)
+    np.testing.assert_array_equal(goals(rest, (2, 0), horizon=5), first[[2, 0]])
+    np.testing.assert_allclose(goals(rest, start=TRAIN_START, horizon=5), first, rtol=1e-12)
+
+
+def test_another_start_changes_the_start_pose_and_only_a_cube_that_is_in_its_way():
+    plain, _ = evaluate.make_agent("p2po", rest)
+    moved, _ = evaluate.make_agent("p2po", rest, start=TRAIN_START)
+    same = 0
+    for i in range(100):
+        for env in (plain, moved):
+            env.reset(seed=evaluate.FIRST_SEED + i)
+        np.testing.assert_allclose(moved.unwrapped.goal, plain.unwrapped.goal, rtol=1e-12)
+        np.testing.assert_allclose(moved.unwrapped.tcp, kinova_env.cartesian(*TRAIN_START), atol=1e-6)
+        same += np.allclose(moved.unwrapped.cube, plain.unwrapped.cube)
+        s, _, terminated, *_ = moved.step(np.zeros(4))
+        assert not terminated
+    assert 90 <= same < 100
+    plain.close()
+    moved.close()
+
+
+def test_the_horizon_is_the_number_of_steps_until_a_timeout():
+    (row,), _ = evaluate.run_trials("p2p", rest, 1, horizon=7, quiet=True)
+    assert (row["length"], row["failure"]) == (7, "timeout")
+
+
+def test_nothing_depends_on_the_number_of_jobs():
+    one, two = (evaluate.run_trials("p2p", "fast", 11, 3, horizon=60, jobs=jobs, quiet=True) for jobs in (1, 2))
+    assert one[0] == two[0] and [row["trial"] for row in one[0]] == list(range(3, 14))
     assert len({row["e95_cm"] for row in one[0]}) == 11
     assert one[1].keys() == two[1].keys()
     for name in one[1]:
         np.testing.assert_array_equal(one[1][name], two[1][name])
 
 
-def test_the_first_trials_of_a_longer_study_are_the_shorter_one():
+def test_trials_have_their_number_wherever_a_study_begins():
     rows, _ = evaluate.run_trials("p2p", "fast", trials=12, quiet=True)
-    assert rows[:3] == evaluate.run_trials("p2p", "fast", trials=3, quiet=True)[0] and len(rows) == 12
-    assert any(row["success"] for row in rows)
+    assert rows[9:] == evaluate.run_trials("p2p", "fast", 3, first_trial=9, quiet=True)[0]
+    assert len(rows) == 12 and any(row["success"] for row in rows)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_trajectories_are_those_of_the_trials_one_after_another(monkeypatch, task):
+def test_a_folder_its_policy_and_any_callable_are_tested_alike(run_folder):
+    policy = evaluate.load_policy(run_folder)
+    sources = (run_folder, str(run_folder / "policy.pt"), lambda obs: policy(obs))
+    one, two, three = (evaluate.run_trials("p2p", s, 2, horizon=20, quiet=True)[0] for s in sources)
+    assert one == two == three
+    with pytest.raises(logx.BadInput, match="of task p2p, not of pnp"):
+        evaluate.run_trials("pnp", run_folder, 1)
+
+
+def test_trajectories_are_those_of_the_trials_one_after_another(monkeypatch):
     monkeypatch.setattr(evaluate, "PATHS", 2)
-    rows, kept = evaluate.run_trials(task, "fast", trials=3, quiet=True)
-    assert kept["length"].tolist() == [row["length"] for row in rows]
-    assert kept["success"].tolist() == [bool(row["success"]) for row in rows]
-    ends = np.cumsum(kept["length"] + 1)
-    assert len(kept["error"]) == ends[-1] and len(kept["tcp"]) == ends[1] and kept["tcp"].shape[1] == 3
-    np.testing.assert_allclose(100 * kept["error"][ends - 1], [row["final_error_cm"] for row in rows], rtol=1e-5)
-    distance = np.linalg.norm(kept["tcp"] - np.repeat(kept["goal"], kept["length"][:2] + 1, axis=0), axis=1)
-    np.testing.assert_allclose(distance, kept["error"][: ends[1]], atol=1e-5)
-    assert kept["object"].shape == (2, 3) and np.isnan(kept["object"]).all() == (task == "p2p")
+    for task in ("p2p", "pnp"):
+        rows, kept = evaluate.run_trials(task, "fast", trials=3, quiet=True)
+        assert kept["length"].tolist() == [row["length"] for row in rows]
+        assert kept["success"].tolist() == [bool(row["success"]) for row in rows]
+        ends = np.cumsum(kept["length"] + 1)
+        assert len(kept["error"]) == ends[-1] and kept["tcp"].shape == (ends[1], 3)
+        np.testing.assert_allclose(100 * kept["error"][ends - 1], [row["final_error_cm"] for row in rows], rtol=1e-5)
+        distance = np.linalg.norm(kept["tcp"] - np.repeat(kept["goal"], kept["length"][:2] + 1, axis=0), axis=1)
+        np.testing.assert_allclose(distance, kept["error"][: ends[1]], atol=1e-5)
+        assert kept["object"].shape == (2, 3) and np.isnan(kept["object"]).all() == (task == "p2p")
+    # the cube's place is that of the start, not the one it was carried to
+    assert kept["success"][0] and np.linalg.norm(kept["object"][0] - kept["goal"][0]) > 0.06
+
+
+def test_training_is_shown_validation_trials_of_its_own_horizon_and_no_random_state_changes(monkeypatch):
+    seen, trial = [], evaluate.trial
+    monkeypatch.setattr(evaluate, "trial", lambda env, act, i: seen.append(trial(env, act, i)) or seen[-1])
+    torch.manual_seed(0)
+    np.random.seed(0)
+    before = torch.get_rng_state(), np.random.get_state()[1].tolist()
+    flags = SimpleNamespace(task="p2p", eval_trials=3, max_ep_len=30)
+    found = evaluate.while_training(stored(), flags)
+    rows = [row for row, *_ in seen]
+    assert [row["trial"] for row in rows] == [10_000, 10_001, 10_002] and max(row["length"] for row in rows) <= 30
+    assert found == {name: pytest.approx(np.mean([row[name[5:]] for row in rows]))
+                     for name in ("eval_success", "eval_return")}  # fmt: skip
+    assert torch.equal(torch.get_rng_state(), before[0]) and np.random.get_state()[1].tolist() == before[1]
+
+
+# ---- metrics and intervals -------------------------------------------------------------------------------------------
 
 
 def trial_row(success, **values):
@@ -189,12 +222,16 @@ def test_metrics_average_the_successful_trials_only():
             trial_row(0, effort_percent=90, length=400, e95_cm=80, **{"return": -2.0}),
             trial_row(1, effort_percent=20, length=140, e95_cm=6, **{"return": 9.5}),
             trial_row(0, effort_percent=90, length=400, e95_cm=80, **{"return": -2.0})]  # fmt: skip
-    assert evaluate.metrics(rows) == {"P_scs_percent": 50, "T_eff": 15, "R_test": 9.25, "E_95_cm": 5, "steps": 120}
+    found = {"P_scs_percent": 50, "T_eff": 15, "R_test": 9.25, "E_95_cm": 5, "steps": 120}
+    assert evaluate.metrics(rows) == found
+    pandas = pytest.importorskip("pandas")
+    assert evaluate.metrics(pandas.DataFrame(rows)) == found
+    assert evaluate.over_trials(pandas.DataFrame(rows)) == evaluate.over_trials(rows)
 
 
-def test_intervals_are_wilsons_for_success_and_students_for_the_means():
+def test_over_trials_is_wilsons_for_success_and_students_over_the_successful():
     rows = [trial_row(1, effort_percent=x, length=100) for x in (10, 12, 14, 20)] + [trial_row(0)] * 6
-    found = evaluate.intervals(rows)
+    found = evaluate.over_trials(rows)
     z, n, p = 1.959964, 10, 0.4
     centre = (p + z**2 / 2 / n) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * math.sqrt(p * (1 - p) / n + z**2 / 4 / n**2)
@@ -204,190 +241,204 @@ def test_intervals_are_wilsons_for_success_and_students_for_the_means():
     assert found["steps"] == pytest.approx((100, 100))
 
 
-def test_success_is_counted_by_the_quarter_the_goal_is_in():
-    angles = [(-3.1, 1), (-1.6, 0), (-1.5, 1), (0.1, 0), (0.2, 0), (3.1, 1), (-math.pi, 1), (math.pi, 1)]
-    assert evaluate.sectors([trial_row(won, goal_theta=t) for t, won in angles])[:3] == [75, 100, 0]
-    assert math.isnan(evaluate.sectors([trial_row(1, goal_theta=-3.0)])[3])
+def test_over_seeds_is_students_of_the_known_values_and_nothing_is_known_of_one():
+    half = 4.302653 * 1 / math.sqrt(3)  # t of 2 degrees of freedom
+    assert evaluate.over_seeds([1, math.nan, 2, 3]) == pytest.approx((2, 2 - half, 2 + half), rel=1e-5)
+    assert evaluate.over_seeds([5, 5]) == (5, 5, 5)
+    assert evaluate.over_seeds([5, math.nan]) == pytest.approx((5, math.nan, math.nan), nan_ok=True)
+    assert all(math.isnan(x) for x in evaluate.over_seeds([math.nan]))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_difference_is_welchs():
+    a, b = [90.0, 95, 97, math.nan], [60.0, 85, 70, 65, 88]
+    welch = stats.ttest_ind(a[:3], b, equal_var=False).confidence_interval()
+    assert evaluate.difference(a, b) == pytest.approx((94 - 73.6, welch.low, welch.high))
+    assert evaluate.difference([3, 3], [1, 1]) == (2, 2, 2)
+    assert evaluate.difference([3], [1, 2]) == pytest.approx((1.5, math.nan, math.nan), nan_ok=True)
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 10])
+def test_the_intervals_cover_the_truth_of_normal_seeds(n):
+    rng = np.random.default_rng(n)
+    a, b = rng.normal(50, 10, (2000, n)), rng.normal(40, 10, (2000, n))
+    for truth, found in ((50, map(evaluate.over_seeds, a)), (10, map(evaluate.difference, a, b))):
+        _, low, high = np.array(list(found)).T
+        assert np.mean((low <= truth) & (truth <= high)) >= 0.93
 
 
 def test_paired_differences_are_over_the_same_trials_and_where_both_succeed():
-    one = [trial_row(1, length=100), trial_row(1, length=120), trial_row(0, length=400), trial_row(1, length=90)]
-    two = [trial_row(1, length=110), trial_row(0, length=400), trial_row(0, length=400), trial_row(1, length=130)]
+    one, two = ([trial_row(won, length=n, trial=i) for i, (won, n) in enumerate(trials)] for trials in (
+        [(1, 100), (1, 120), (0, 400), (1, 90)], [(1, 110), (0, 400), (0, 400), (1, 130)]))  # fmt: skip
     found = evaluate.paired(one, two)
-    mean, low, high = found["P_scs_percent"]
-    assert mean == 25 and low == 0 and 50 <= high <= 75
-    mean, low, high = found["steps"]
-    assert (mean, low, high) == (-25, -40, -10)  # two pairs: the interval is all of them
+    assert found["P_scs_percent"] == evaluate.over_seeds([0, 100, 0, 0])
+    assert found["steps"] == evaluate.over_seeds([-10, -40])
     assert evaluate.paired(one, one)["P_scs_percent"] == (0, 0, 0)
     assert math.isnan(evaluate.paired(two[1:3], one[1:3])["T_eff"][0])
+    with pytest.raises(ValueError, match="same trials"):
+        evaluate.paired(one[:2], two[1:3])
 
 
-def test_metrics_are_nan_and_the_table_still_prints_where_no_trial_succeeded(capsys):
-    rows = [trial_row(0), trial_row(0, failure="timeout"), trial_row(0)]
-    m = evaluate.metrics(rows)
+@pytest.mark.filterwarnings("error")
+def test_the_table_prints_where_no_trial_succeeded_and_fits_100_columns(capsys):
+    lost = [trial_row(0, trial=0), trial_row(0, trial=1, failure="timeout"), trial_row(0, trial=2)]
+    values = dict(effort_percent=12.3, length=123, e95_cm=4.56)
+    won = [trial_row(1, trial=i, **values, **{"return": 10 + i / 7}) for i in range(3)]
+    m = evaluate.metrics(lost)
     assert m.pop("P_scs_percent") == 0 and len(m) == 4 and all(math.isnan(value) for value in m.values())
-    evaluate.print_table({"an agent": rows})
-    line = capsys.readouterr().out.splitlines()[1]
-    assert line.split()[:4] == ["an", "agent", "3", "0.0"] and line.endswith("2 self, 1 timeout")
+    evaluate.print_table({"an agent": lost, "another": won}, versus="an agent")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == "an agent" and lines[2].split() == ["0.0", "[0.0,", "56.1]", "N/A", "N/A", "N/A", "N/A"]
+    assert lines[3] == "  3 trials: 2 self, 1 timeout" and max(map(len, lines)) <= 100
 
 
 # ---- policies --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("symmetry", ["none", "gas", "so2", "canonical"])
-def test_a_loaded_policy_acts_as_the_actor_did_in_training(tmp_path, task, symmetry):
-    agent = learner(task, symmetry, seed=5)
-    with torch.no_grad():
-        agent.net.flat.mul_(3)  # far into the tanh
-    policy = evaluate.load_policy(saved(tmp_path / "run", agent.policy()))
-    env = gymnasium.make(TASKS[task].env_id, stage="train", disable_env_checker=True)
+@pytest.mark.parametrize("symmetry", ["none", "canonical"])
+def test_a_loaded_policy_acts_as_the_actor_does_in_training(tmp_path, symmetry):
+    torch.manual_seed(5)
+    learner = ddpg.Learner(ddpg.resolve(ddpg.Flags(task="p2po", symmetry=symmetry, hidden_sizes=(16, 16))))
+    policy = evaluate.load_policy(saved(tmp_path / "run", learner.policy()))
+    env, _ = evaluate.make_agent("p2po", rest)
     env.action_space.seed(0)
     s, _ = env.reset(seed=0)
-    differs = 0
     for _ in range(20):
-        view = gas.canonical(s) if symmetry == "canonical" else s
-        with torch.inference_mode():
-            a = torch.tanh(agent.actor(torch.from_numpy(view))).numpy()
-            raw = torch.tanh(agent.actor(torch.from_numpy(s))).numpy()
-        assert np.array_equal(policy(s), a) and policy(s).dtype == np.float32 and policy(s).shape == (4,)
-        differs += not np.array_equal(a, raw)
+        assert np.array_equal(policy(s), learner.act(s)) and policy(s).dtype == np.float32
         s = env.step(env.action_space.sample())[0]
-    assert policy.task == task and differs == (20 if symmetry == "canonical" else 0)
     env.close()
 
 
-def test_a_canonical_policy_acts_alike_in_a_turned_world(tmp_path):
-    policy = evaluate.load_policy(saved(tmp_path / "run", learner(symmetry="canonical").policy()))
-    other = evaluate.load_policy(saved(tmp_path / "other", learner(symmetry="so2").policy()))
-    env = gymnasium.make("KinovaP2P-v0", disable_env_checker=True)
+def test_a_canonical_policy_acts_alike_in_a_turned_world():
+    env, _ = evaluate.make_agent("p2p", rest)
     s, _ = env.reset(seed=0)
-    assert np.allclose(policy(gas.rotate(s, 1.3)), policy(s), atol=1e-5)
-    assert not np.allclose(other(gas.rotate(s, 1.3)), other(s), atol=1e-3)
+    canonical, other = (evaluate.Policy(stored(symmetry=symmetry)) for symmetry in ("canonical", "so2"))
+    assert np.allclose(canonical(gas.rotate(s, 1.3)), canonical(s), atol=1e-4)
+    assert not np.allclose(other(gas.rotate(s, 1.3)), other(s), atol=1e-2)
     env.close()
 
 
-def test_a_linear_policy_is_clipped_to_the_action_range(tmp_path):
-    stored = learner().policy() | {"output": "linear"}
-    stored["weights"]["4.bias"] = torch.tensor([50.0, -50.0, 0.3, 0.0])
-    stored["weights"]["4.weight"] = torch.zeros(4, 16)
-    act = evaluate.load_policy(saved(tmp_path / "run", stored))
-    assert act(np.zeros(22, np.float32)).tolist() == pytest.approx([1, -1, 0.3, 0])
+def test_a_linear_policy_is_clipped_to_the_action_range():
+    policy = stored(output="linear")
+    policy["weights"] |= {"2.weight": torch.zeros(4, 16), "2.bias": torch.tensor([50.0, -50.0, 0.3, 0.0])}
+    assert evaluate.Policy(policy)(np.zeros(22, np.float32)).tolist() == pytest.approx([1, -1, 0.3, 0])
 
 
-def bad_policies():
-    """{what: bytes of a policy.pt that load_policy must refuse, or what to save in it}."""
-    good = learner().policy()
-    whole = Path("policy.pt")
-    three = {"4.weight": torch.zeros(3, 16), "4.bias": torch.zeros(3)}
-    return {
-        "missing": None,
-        "empty": b"",
-        "text": b"not a policy\n",
-        "pickled object": pickle.dumps(Object()),
-        "object saved by torch": {"weights": Object()},
-        "truncated": whole,
-        "a tensor": torch.zeros(3),
-        "a list": [1, 2],
-        "no weights": {key: value for key, value in good.items() if key != "weights"},
-        "no sizes": {key: value for key, value in good.items() if key != "sizes"},
-        "unknown task": good | {"task": "p3p"},
-        "another task's observation": good | {"task": "pnp"},
-        "other sizes": good | {"sizes": [22, 8, 8, 4]},
-        "sizes of text": good | {"sizes": ["22", "4"]},
-        "weights of another kind": good | {"weights": [1.0]},
-        "a weight that is no tensor": good | {"weights": good["weights"] | {"0.bias": "x"}},
-        "three actions": good | {"sizes": [22, 16, 16, 3], "weights": good["weights"] | three},
-    }  # fmt: skip
+def test_a_policy_with_a_grasp_input_is_told_whether_the_cube_is_in_the_gripper():
+    policy = stored("pnp", grasp_input=True, output="linear")
+    policy["weights"] = {name: torch.zeros_like(w) for name, w in policy["weights"].items()}
+    policy["weights"]["0.weight"][0, -1] = policy["weights"]["2.weight"][0, 0] = 1.0
+    act, s = evaluate.Policy(policy), np.zeros(25, np.float32)
+    s[kinova_env.INDEX["pnp"]["P_o"]] = (0.3, 0.3, 0.3)
+    assert act(s)[0] == 0
+    s[kinova_env.INDEX["pnp"]["P_o"]] = 0  # P_e = P_g - e
+    assert act(s)[0] == 1
 
 
-def put(folder, what):
-    """A run folder with this bad policy."""
-    folder.mkdir()
-    content = bad_policies()[what]
-    if isinstance(content, bytes):
-        (folder / "policy.pt").write_bytes(content)
-    elif isinstance(content, Path):
-        saved(folder, learner().policy())
-        (folder / "policy.pt").write_bytes((folder / "policy.pt").read_bytes()[:-300])
-    elif content is not None:
-        saved(folder, content)
-    return folder
+def test_the_published_policies_act():
+    published = sorted(Path(evaluate.__file__).parent.glob("data/results/*/policy.pt"))
+    assert published
+    for path in published:
+        policy = evaluate.load_policy(path)
+        a = policy(np.zeros(OBS_DIM[policy.task], np.float32))
+        assert a.shape == (4,) and np.abs(a).max() <= 1
+
+
+class Object:
+    """Not a plain type."""
+
+
+BAD_POLICIES = {
+    "missing": None,
+    "text": b"not a policy\n",
+    "pickled object": pickle.dumps(Object()),
+    "object saved by torch": {"weights": Object()},
+    "a tensor": torch.zeros(3),
+    "a list": [1, 2],
+    "no weights": {"task": "p2p", "symmetry": "none", "sizes": [22, 4], "output": "tanh"},
+    "another task's observation": stored() | {"task": "pnp"},
+    "other sizes": stored() | {"sizes": [22, 8, 4]},
+    "weights of another kind": stored() | {"weights": [1.0]},
+}
 
 
 @pytest.mark.filterwarnings("error")  # a warning is a second line on standard error
-@pytest.mark.parametrize("what", bad_policies())
+@pytest.mark.parametrize("what", BAD_POLICIES)
 def test_a_file_that_is_no_policy_is_refused_with_one_line_that_names_it(tmp_path, what):
-    folder = put(tmp_path / "run", what)
-    with pytest.raises(ValueError) as refused:
-        evaluate.load_policy(folder)
-    assert str(folder / "policy.pt") in str(refused.value) and "\n" not in str(refused.value)
+    path, content = tmp_path / "policy.pt", BAD_POLICIES[what]
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(logx.BadInput) as refused:
+        evaluate.load_policy(tmp_path)
+    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_importing_evaluate_loads_neither_torch_nor_scipy():
+    code = "import evaluate, sys; print({'torch', 'scipy', 'PIL', 'pandas'} & set(sys.modules))"
+    root = Path(evaluate.__file__).parent
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
 
 
 # ---- command line ----------------------------------------------------------------------------------------------------
 
 
-def main(monkeypatch, *argv):
-    """evaluate.main() with this command line; the exit code."""
-    monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, argv)])
-    try:
-        evaluate.main()
-    except SystemExit as stopped:
-        return stopped.code
-    return 0
+@pytest.fixture
+def main(monkeypatch):
+    """main(*words): evaluate.py with this command line; the exit code."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # which main() sets
+
+    def call(*words):
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            logx.run_script(evaluate.main)
+        return ended.value.code
+
+    return call
 
 
-def test_a_study_of_a_run_prints_its_row_and_writes_every_trial(tmp_path, monkeypatch, capsys):
-    folder = saved(tmp_path / "run", learner().policy())
-    (folder / "evaluation.csv").write_text("of an earlier study")
-    assert main(monkeypatch, folder, "--trials", 3) == 0
+def test_a_study_of_runs_prints_their_rows_and_writes_every_trial(run_folder, tmp_path, main, capsys):
+    other = saved(tmp_path / "other", stored(seed=1))
+    (run_folder / "evaluation.csv").write_text("of an earlier study")
+    assert main(run_folder, "--versus", other / "policy.pt", "--trials", 3) == 0
     out = capsys.readouterr().out.splitlines()
-    assert out[0].split()[0] == "agent" and out[1].split()[:2] == [str(folder), "3"]
-    assert sorted(path.name for path in folder.iterdir()) == ["evaluation.csv", "policy.pt", "trajectories.npz"]
-    text = (folder / "evaluation.csv").read_bytes().decode()
+    assert out[1] == str(run_folder) and out[3].startswith("  3 trials: ") and out[4] == str(other / "policy.pt")
+    assert out[8] == f"  minus {other / 'policy.pt'}, the same trials:"
+    assert sorted(path.name for path in run_folder.iterdir()) == ["evaluation.csv", "policy.pt", "trajectories.npz"]
+    text = (run_folder / "evaluation.csv").read_bytes().decode()
     assert text.startswith(HEADER + "\n") and text.count("\n") == 4 and "\r" not in text
-    for written, row in zip(csv.DictReader(text.splitlines()), evaluate.run_trials("p2p", folder, 3, quiet=True)[0],
-                            strict=True):  # fmt: skip
+    rows, _ = evaluate.run_trials("p2p", run_folder, 3, quiet=True)
+    for written, row in zip(csv.DictReader(text.splitlines()), rows, strict=True):
         assert written["failure"] == row.pop("failure")
         assert {name: float(written[name]) for name in row} == pytest.approx(row, rel=1e-5)
-        assert written["success"] in "01" and written["grasped"] in "01"
+    assert (other / "evaluation.csv").read_text() != text
 
 
-def test_a_study_that_fails_leaves_the_earlier_one_whole(tmp_path, monkeypatch):
-    folder = saved(tmp_path / "run", learner().policy())
-    evaluate.write_csv(folder / "evaluation.csv", [trial_row(1)])
-    before = (folder / "evaluation.csv").read_bytes()
-    assert before.startswith(HEADER.encode() + b"\n") and before.count(b"\n") == 2
-    with pytest.raises(ValueError):
-        evaluate.write_csv(folder / "evaluation.csv", [trial_row(0), trial_row(0) | {"no such column": 1}])
-    assert (folder / "evaluation.csv").read_bytes() == before
+@pytest.mark.parametrize("words, what", [
+    (["--start", "0.785", "0.52", "0.42", "--horizon", "9"], "-start_0.785_0.52_0.42-horizon_9"),
+    (["--horizon", "400"], ""),  # T
+    (["--horizon", "9", "--first_trial", "10000"], "-horizon_9-first_trial_10000"),
+])  # fmt: skip
+def test_other_settings_are_written_to_a_file_of_their_own(run_folder, main, words, what):
+    assert main(run_folder, "--trials", 1, *words) == 0
+    assert [path.name for path in run_folder.glob("*.csv")] == [f"evaluation{what}.csv"]
+    assert (run_folder / "trajectories.npz").exists() == (not what)
 
 
-def test_a_study_of_several_runs_gives_each_its_own_file(tmp_path, monkeypatch, capsys):
-    folders = [saved(tmp_path / name, learner(seed=n).policy()) for n, name in enumerate(("a", "b"))]
-    assert main(monkeypatch, *folders, "--trials", 1) == 0
-    rows = [(folder / "evaluation.csv").read_text() for folder in folders]
-    assert rows[0] != rows[1] and all(row.count("\n") == 2 for row in rows)
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]] == [str(f) for f in folders]
+def test_a_published_study_stays_as_it_is_and_another_one_is_written_beside_it(run_folder, main, capsys):
+    (run_folder / "evaluation.csv.gz").write_bytes(b"as it was")
+    assert main(run_folder, "--trials", 1) == 0 and "stays as it is" in capsys.readouterr().out
+    assert sorted(path.name for path in run_folder.iterdir()) == ["evaluation.csv.gz", "policy.pt"]
+    assert main(run_folder, "--trials", 1, "--horizon", 9) == 0
+    assert (run_folder / "evaluation-horizon_9.csv").exists()
 
 
-def test_a_study_versus_another_run_prints_the_paired_differences(tmp_path, monkeypatch, capsys):
-    one, two = (saved(tmp_path / name, learner(seed=n).policy()) for n, name in enumerate(("a", "b")))
-    assert main(monkeypatch, one, "--versus", two, "--trials", 2) == 0
-    out = capsys.readouterr().out
-    assert f"{one} less {two}, the same trials" in out and "P_scs_percent  0.00 [0.00, 0.00]" in out
-    assert (two / "evaluation.csv").exists()
-
-
-def test_a_study_of_the_demonstrator_prints_its_row(monkeypatch, capsys):
-    assert main(monkeypatch, "--pid", "--task", "p2p", "--gains", "fast", "--trials", 2) == 0
-    line = capsys.readouterr().out.splitlines()[1]
-    assert line.startswith("PID, fast gains, p2p") and line.split()[4] == "2"
-
-
-def test_trials_of_the_demonstrator_are_kept_where_a_folder_is_given(tmp_path, monkeypatch):
-    out = tmp_path / "pid-p2p-fast"
-    assert main(monkeypatch, "--pid", "--task", "p2p", "--gains", "fast", "--trials", 2, "--out", out) == 0
+def test_trials_of_the_demonstrator_are_kept_where_a_folder_is_given(tmp_path, main, capsys):
+    out = tmp_path / "new" / "pid-p2p-fast"
+    assert main("--pid", "--task", "p2p", "--gains", "fast", "--trials", 2, "--out", out) == 0
+    assert capsys.readouterr().out.splitlines()[1] == "PID, fast gains, p2p"
     config = json.loads((out / "config.json").read_text())
     assert (config["task"], config["algo"], config["gains"]) == ("p2p", "pid", "fast")
     assert (out / "evaluation.csv").read_text().count("\n") == 3
@@ -395,98 +446,76 @@ def test_trials_of_the_demonstrator_are_kept_where_a_folder_is_given(tmp_path, m
         assert len(kept["length"]) == 2
 
 
-def test_agents_are_filmed_side_by_side_on_the_trials_chosen(tmp_path, monkeypatch):
-    folder, make, seeds = saved(tmp_path / "run", learner().policy()), gymnasium.make, []
+def test_agents_are_filmed_side_by_side_on_the_trials_chosen(run_folder, tmp_path, main, monkeypatch):
+    seeds, make_agent = [], evaluate.make_agent
 
-    def short_make(id_, **settings):
-        env = make(id_, **(settings | {"width": 32, "height": 24, "max_episode_steps": 5}))
+    def small(task, source, **settings):
+        env, act = make_agent(task, source, **(settings | {"width": 32, "height": 24}))
         reset = env.reset
         env.reset = lambda seed: seeds.append(seed) or reset(seed=seed)
-        return env
+        return env, act
 
-    monkeypatch.setattr(gymnasium, "make", short_make)
-    words = [folder, "--pid", "--task", "p2p", "--gif", tmp_path / "both.gif", "--show", 4, 2]
-    assert main(monkeypatch, *words) == 0
+    monkeypatch.setattr(evaluate, "make_agent", small)
+    words = ["--pid", "--task", "p2p", "--gif", tmp_path / "both.gif", "--show", 4, 2, "--horizon", 5]
+    assert main(run_folder, *words) == 0
     assert seeds == [1_000_004, 1_000_004, 1_000_002, 1_000_002]
     with Image.open(tmp_path / "both.gif") as image:
-        assert image.size == (64, 24) and image.n_frames > 1
-    assert main(monkeypatch, folder, "--mp4", tmp_path / "one.mp4", "--show", 0) in (0, 2)
-    assert (tmp_path / "one.mp4").exists() == bool(importlib.util.find_spec("imageio_ffmpeg"))
+        assert image.n_frames > 1 and image.width == 2 * image.height * 4 // 3
+
+
+def test_quick_runs_end_with_a_table_beside_the_demonstrator_the_trials_and_a_film(run_folder, monkeypatch, capsys):
+    run_trials, filmed = evaluate.run_trials, []
+    monkeypatch.setattr(evaluate, "run_trials", lambda task, source, n, quiet: run_trials(task, source, n // 50))
+    monkeypatch.setattr(evaluate.pid_demo, "film", lambda agents, path, seeds: filmed.append((path, len(seeds))))
+    evaluate.after_training(run_folder, "p2p", None, quiet=True)
+    out = capsys.readouterr().out.splitlines()
+    assert out[1] == str(run_folder) and out[4] == "PID, fast gains" and out[3].startswith("  2 trials")
+    assert (run_folder / "evaluation.csv").read_text().count("\n") == 3
+    assert filmed == [(run_folder / "agent.gif", 6)]
+
+
+def test_the_list_names_each_trained_agent_with_its_success_and_the_command_that_watches_it(
+    tmp_path, main, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    Path("data/runs").mkdir(parents=True)
+    own = saved(Path("data/runs/own"), stored())
+    (own / "config.json").write_text(json.dumps({"task": "p2p", "algo": "ddpg", "recipe": "robust"}))
+    evaluate.write(own, [trial_row(1), trial_row(0)], {})
+    assert main("--list") == 0
+    out = capsys.readouterr().out.splitlines()
+    shipped = Path(evaluate.__file__).parent.glob("data/results/*/policy.pt")
+    for folder in (own, *(Path(os.path.relpath(path.parent)) for path in shipped)):
+        assert f"    python evaluate.py {folder} --watch" in out
+    before = out[out.index(f"    python evaluate.py {own} --watch") - 1]
+    assert before == "p2p ddpg robust - 50.0 % of 2 test trials"
 
 
 BAD = {
     "neither a run nor the PID": ([], "--pid"),
     "the PID without a task": (["--pid"], "--task"),
-    "an unknown task": (["--pid", "--task", "p3p"], "--task"),
-    "unknown gains": (["--pid", "--task", "p2p", "--gains", "x"], "--gains"),
-    "no trials": (["{run}", "--trials", "0"], "--trials"),
-    "a negative number of trials": (["{run}", "--trials", "-3"], "--trials"),
-    "half a trial": (["{run}", "--trials", "1.5"], "--trials"),
-    "no jobs": (["{run}", "--jobs", "0"], "--jobs"),
-    "an unknown folder": (["{tmp}/nowhere"], "nowhere"),
-    "a file": (["{run}/policy.pt"], "policy.pt"),
-    "a run and an unknown folder": (["{run}", "{tmp}/nowhere"], "nowhere"),
-    "an unknown flag": (["{run}", "--nonsense"], "--nonsense"),
-    "a GIF in no folder": (["{run}", "--gif", "{tmp}/nowhere/a.gif"], "--gif"),
-    "a GIF of two tasks": (["{run}", "--pid", "--task", "pnp", "--gif", "{tmp}/a.gif"], "--gif"),
-    "two tasks compared": (["--pid", "--task", "pnp", "--versus", "{run}"], "--versus"),
-    "a GIF named as a video": (["{run}", "--gif", "{tmp}/a.mp4"], ".gif"),
-    "a GIF of no name": (["{run}", "--gif="], "--gif"),
-    "no folder for the PID's trials": (["--pid", "--task", "p2p", "--out="], "--out"),
     "a task of a run": (["{run}", "--task", "p2p"], "--task"),
-    "gains of a run": (["{run}", "--gains", "fast"], "--gains"),
+    "no trials": (["{run}", "--trials", "0"], "--trials"),
+    "a run and an unknown folder": (["{run}", "{tmp}/nowhere"], "nowhere"),
+    "a start out of reach": (["{run}", "--start", "0", "2", "0.4"], "--start"),
+    "a GIF in no folder": (["{run}", "--gif", "{tmp}/nowhere/a.gif"], "--gif"),
+    "a GIF named otherwise": (["{run}", "--gif", "{tmp}/a.png"], ".gif"),
+    "two tasks compared": (["--pid", "--task", "pnp", "--versus", "{run}"], "--versus"),
     "a window for two": (["{run}", "--pid", "--task", "p2p", "--watch"], "--watch"),
-    "a film twice": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
-    "a trial before the first": (["{run}", "--gif", "{tmp}/a.gif", "--show", "-1"], "--show"),
-    "a folder for a run's trials": (["{run}", "--out", "{tmp}/out"], "--out"),
-    "an unknown run to compare with": (["{run}", "--versus", "{tmp}/nowhere"], "nowhere"),
-    "missing": (["{tmp}/bad"], "policy.pt"),
-    "truncated": (["{tmp}/bad"], "policy.pt"),
-    "pickled object": (["{tmp}/bad"], "policy.pt"),
-    "a tensor": (["{tmp}/bad"], "policy.pt"),
-    "another task's observation": (["{tmp}/bad"], "policy.pt"),
+    "a window without a display": (["{run}", "--watch"], "--watch"),
+    "a film and a window": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
+    "a folder that is a file": (["--pid", "--task", "p2p", "--trials", "1", "--out", "{run}/policy.pt/a"], "policy.pt"),
 }
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("what", BAD)
-def test_bad_input_is_exit_code_2_and_one_line_that_names_it(what, run_folder, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_exit_code_2_and_one_line_that_names_it(what, run_folder, tmp_path, main, monkeypatch, capsys):
     argv, named = BAD[what]
-    if "{tmp}/bad" in argv:
-        put(tmp_path / "bad", what)
+    monkeypatch.delenv("DISPLAY", raising=False)
     before = sorted(tmp_path.rglob("*"))
     capsys.readouterr()
-    code = main(monkeypatch, *(word.format(run=run_folder, tmp=tmp_path) for word in argv), "--trials" not in argv
-                and "--trials=1" or "--jobs=1")  # fmt: skip
+    assert main(*(word.format(run=run_folder, tmp=tmp_path) for word in argv)) == 2
     out, err = capsys.readouterr()
-    assert code == 2 and not out and err.count("\n") == 1 and named in err
-    assert sorted(tmp_path.rglob("*")) == before and not (run_folder / "evaluation.csv").exists()
-
-
-def test_a_film_that_cannot_be_written_is_one_line_and_leaves_nothing(run_folder, tmp_path, monkeypatch, capsys):
-    def no_room(*args):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pid_demo.os, "replace", no_room)
-    assert main(monkeypatch, run_folder, "--gif", tmp_path / "a.gif", "--show", 0) == 2
-    out, err = capsys.readouterr()
-    assert not out and err.count("\n") == 1 and "a.gif: cannot be written (No space left on device)" in err
-    assert not list(tmp_path.glob("*.gif")) and not list(tmp_path.glob(".part*"))
-
-
-def test_a_published_run_is_tested_and_left_as_it_is(run_folder, tmp_path, monkeypatch, capsys):
-    published = tmp_path / "results"
-    published.mkdir()
-    (published / "policy.pt").write_bytes((run_folder / "policy.pt").read_bytes())
-    (published / "evaluation.csv.gz").write_bytes(b"as it was")
-    assert main(monkeypatch, published, "--trials", 1) == 0
-    assert "stay as they are" in capsys.readouterr().out
-    assert sorted(path.name for path in published.iterdir()) == ["evaluation.csv.gz", "policy.pt"]
-
-
-def test_the_cube_of_a_pick_and_place_trial_is_where_it_was_at_the_start():
-    _, trajectories = evaluate.run_trials("pnp", "fast", trials=1, quiet=True)
-    env = gymnasium.make(TASKS["pnp"].env_id, stage="test")
-    env.reset(seed=evaluate.FIRST_SEED)
-    np.testing.assert_array_equal(trajectories["object"], [env.unwrapped.cube])
-    assert trajectories["success"][0] and np.linalg.norm(trajectories["object"] - trajectories["goal"]) > 0.06
+    assert not out and err.count("\n") == 1 and named in err
+    assert sorted(tmp_path.rglob("*")) == before
