@@ -124,7 +124,7 @@ def load_policy(run):
 class OtherStart(gymnasium.Wrapper):
     """Episodes from another start pose (theta, rho, z), towards the goal that their seed draws without it.
 
-    What is drawn again when a start collides is then the cube alone; a goal within reach of the start is kept."""
+    Where the arm would start in the cube, the cube alone is drawn again; a goal at the start pose stays."""
 
     def __init__(self, env, start):
         super().__init__(env)
@@ -369,7 +369,7 @@ def print_agents():
         with contextlib.suppress(OSError, ValueError):
             config = json.loads((path.parent / "config.json").read_text())
         for name, read in (("evaluation.csv", open), ("evaluation.csv.gz", gzip.open)):
-            with contextlib.suppress(FileNotFoundError), read(path.parent / name, "rt") as file:
+            with contextlib.suppress(OSError), read(path.parent / name, "rt") as file:
                 success = [row["success"] == "1" for row in csv.DictReader(file)]
                 tested = f"{100 * np.mean(success):.1f} % of {len(success)} test trials"
         print(*(config.get(key, "?") for key in ("task", "algo", "recipe")), f"- {tested}")
@@ -392,6 +392,7 @@ def check(flags):
         (gif and (gif.is_dir() or not gif.absolute().parent.is_dir()), f"--gif {gif}: must be a file in a folder"),
         (gif and gif.suffix == ".mp4" and no_video, f"--gif {gif}: needs pip install imageio imageio-ffmpeg"),
         (gif and flags.watch, "--gif, --watch: one of them at a time"),
+        (flags.show and not (gif or flags.watch), "--show: goes with --gif or --watch; --first_trial else"),
         (flags.watch and len(flags.runs) + flags.pid + bool(flags.versus) > 1, "--watch: one agent at a time"),
     ):
         if wrong:

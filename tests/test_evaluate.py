@@ -503,6 +503,7 @@ BAD = {
     "two tasks compared": (["--pid", "--task", "pnp", "--versus", "{run}"], "--versus"),
     "a window for two": (["{run}", "--pid", "--task", "p2p", "--watch"], "--watch"),
     "a window without a display": (["{run}", "--watch"], "--watch"),
+    "trials to show in no film": (["{run}", "--show", "1"], "--show"),
     "a film and a window": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
     "a folder that is a file": (["--pid", "--task", "p2p", "--trials", "1", "--out", "{run}/policy.pt/a"], "policy.pt"),
 }
