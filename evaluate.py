@@ -1,11 +1,11 @@
 """The test study (Sec. 5.2): watch trained agents, and measure them.
 
-    python evaluate.py --list                           # the trained agents here
-    python evaluate.py data/results/NAME --gif agent.gif          # film one, or
-    python evaluate.py data/results/NAME --watch                  # in a window
-    python evaluate.py data/runs/NAME --trials 500 --jobs 2       # measure it
-    python evaluate.py data/runs/NAME --versus data/runs/OTHER    # the same trials
-    python evaluate.py --pid --task p2p --gains fast              # the PID
+    python evaluate.py --list                               # trained agents
+    python evaluate.py data/results/NAME --gif agent.gif    # film one, or
+    python evaluate.py data/results/NAME --watch            # in a window
+    python evaluate.py data/runs/NAME --trials 500 --jobs 2
+    python evaluate.py data/runs/NAME --versus data/runs/OTHER
+    python evaluate.py --pid --task p2p --gains fast        # the demonstrator
 
 Measuring prints a table and writes NAME/evaluation.csv, one row a trial. With
 --first_trial, --start or --horizon it is another study, written to a file of
