@@ -128,8 +128,8 @@ def test_job_that_is_requeued_in_mid_run_ends_where_an_unbroken_run_ends(cluster
 
 
 def test_job_whose_time_is_up_saves_its_state_is_queued_again_and_goes_on(cluster, tmp_path):
-    long = ["--task", "p2p", "--columns", "baseline", "--epochs", 100, "--steps_per_epoch", 1000]
-    flags = [*long, "--seeds", 1, "--time", 2, "--signal_delay", 30]
+    endless = ["--task", "p2p", "--columns", "baseline", "--epochs", 100_000_000, "--steps_per_epoch", 1000]
+    flags = [*endless, "--seeds", 1, "--time", 2, "--signal_delay", 30]
     (only,) = submit(tmp_path, *flags)
     wait_for(lambda: "this job is timed-out" in logs(tmp_path), 180)
     wait_for(lambda: only.state()[0] == "queued")
