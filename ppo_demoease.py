@@ -412,7 +412,7 @@ def loop(f, run):
     torch.manual_seed(f.seed)
     rng = np.random.default_rng(f.seed)  # of exploration
     env = gymnasium.make(TASKS[f.task].env_id, stage="train", max_episode_steps=f.max_ep_len, disable_env_checker=True)
-    env = logx.Replayable(env, seed=f.seed)
+    env = logx.Replayable(env, f.seed)
     learner = Learner(f)
 
     state = run.checkpoint
