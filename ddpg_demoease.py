@@ -69,6 +69,7 @@ class Flags:
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of actor, then critic, before the first step; 0, robust: 2500", low=0)
+    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of B_d")
     hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
     critics: int | None = flag(None, "of which the smallest value counts; 1, robust: 2", low=1, high=2)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
@@ -96,11 +97,11 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; the paper trains pnp with PPO: its sizes
     "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
-             hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False, clip_target=False,
-             lr_decay=False, retry=0.0)  # fmt: skip
+             normalize_obs=False, hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False,
+             clip_target=False, lr_decay=False, retry=0.0)  # fmt: skip
 ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
-              hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True, clip_target=True,
-              lr_decay=True, retry=0.5, start_steps=0)  # fmt: skip
+              normalize_obs=True, hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True,
+              clip_target=True, lr_decay=True, retry=0.5, start_steps=0)  # fmt: skip
 ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs=40),
                "pnp": dict(epochs=50, hindsight=0)}  # another goal would not say where the cube is grasped
 
@@ -217,21 +218,30 @@ def mlp(sizes, layernorm=False):
 
 
 class ActorCritic(nn.Module):
-    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R."""
+    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R, on (s - s_mean) / s_std."""
 
     def __init__(self, obs_dim, hidden_sizes, critics, critic_layernorm):
         super().__init__()
-        self.mu = mlp([obs_dim, *hidden_sizes, 4])  # before the tanh
-        self.nu = nn.ModuleList(mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm) for _ in range(critics))
+        self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
+        self.q_nets = nn.ModuleList(mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm) for _ in range(critics))
+        self.register_buffer("s_mean", torch.zeros(obs_dim))
+        self.register_buffer("s_std", torch.ones(obs_dim))
+
+    def inputs(self, s):
+        return (s - self.s_mean) / self.s_std
+
+    def u(self, s):
+        """The action before its tanh, of s (n, obs_dim): (n, 4)."""
+        return self.mu_net(self.inputs(s))
 
     def pi(self, s):
         """pi_mu(s) of s (n, obs_dim): (n, 4)."""
-        return torch.tanh(self.mu(s))
+        return torch.tanh(self.u(s))
 
-    def Qs(self, s, a):
-        """Every critic's value of s (n, obs_dim), a (n, 4): (critics, n)."""
-        x = torch.cat((s, a), dim=-1)
-        return torch.stack([q(x).squeeze(-1) for q in self.nu])
+    def Qs(self, s, a, first=None):
+        """Each of the (first) critics' value of s (n, obs_dim), a (n, 4): (critics, n)."""
+        x = torch.cat((self.inputs(s), a), dim=-1)
+        return torch.stack([q(x).squeeze(-1) for q in self.q_nets[:first]])
 
     def Q(self, s, a):
         """Q_nu: the smallest of the critics' values (TD3, Fujimoto et al. 2018). (n,)."""
@@ -280,18 +290,18 @@ class Learner:
         f = self.flags = flags
         self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.critics, f.critic_layernorm).to(f.device)
         self.target = deepcopy(self.net).requires_grad_(False)
-        self.mu, self.nu = list(self.net.mu.parameters()), list(self.net.nu.parameters())
+        self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_nets.parameters())
         self.optimizer = torch.optim.Adam([dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)],
                                           fused=True)  # fmt: skip
         self.target_parameters, self.move_targets = list(self.target.parameters()), get_ema_multi_avg_fn(f.polyak)
-        self.actor = self.net.mu if f.device == "cpu" else deepcopy(self.net.mu).cpu()  # what acts
+        self.actor = self.net if f.device == "cpu" else deepcopy(self.net).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     @torch.inference_mode()
     def act(self, s):
         """pi_mu of one observation, as the networks see it: (4,) numpy."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
-        a = torch.tanh(self.actor(torch.from_numpy(s))).numpy()
+        a = self.actor.pi(torch.from_numpy(s)).numpy()
         if not np.isfinite(a).all():
             raise logx.NotFinite("the actor gives NaN; go on from the last checkpoint, or begin anew")
         return a
@@ -306,8 +316,8 @@ class Learner:
         """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
         for i in range(n):
             measured = self.update(B_o, B_d, measure=i == n - 1)
-        if self.actor is not self.net.mu:
-            self.actor.load_state_dict(self.net.mu.state_dict())
+        if self.actor is not self.net:
+            self.actor.load_state_dict(self.net.state_dict())
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
     def update(self, B_o, B_d, measure=False, hold_actor=False):
@@ -323,9 +333,9 @@ class Learner:
         L_C = loss_C(Q, y)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
-        u, u_demo = net.mu(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
+        u, u_demo = net.u(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
         a_hat = torch.tanh(u_demo)
-        L_O = loss_O(net.Qs(s, torch.tanh(u))[0])
+        L_O = loss_O(net.Qs(s, torch.tanh(u), first=1))
         with torch.no_grad():
             Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat)
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
@@ -349,15 +359,21 @@ class Learner:
         )]  # fmt: skip
 
     def clone(self, B_o, B_d):
-        """Before the first step: clone_iters updates of the actor on B_d with M = 1, then of the critic alone."""
+        """Before the first step: observations are normalised by B_d, then clone_iters updates of the actor on B_d with
+        M = 1, and of the critic alone."""
         f, net = self.flags, self.net
+        if f.normalize_obs:
+            s = B_d.rows[:, : OBS_DIM[f.task]]
+            for x in (net, self.target):
+                x.s_mean.copy_(s.mean(0))
+                x.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
         for _ in range(f.clone_iters):
             s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a_demo, net.pi(s_demo), torch.ones_like(a_demo[:, 0]))
             self.optimizer.zero_grad()
             L_BC.backward()
             self.optimizer.step()
-        self.target.mu.load_state_dict(net.mu.state_dict())
+        self.target.load_state_dict(net.state_dict())
         for _ in range(f.clone_iters):
             self.update(B_o, B_d, hold_actor=True)
 
@@ -368,12 +384,14 @@ class Learner:
     def load(self, state):
         for name, part in state.items():
             getattr(self, name).load_state_dict(part)
-        self.actor.load_state_dict(self.net.mu.state_dict())
+        self.actor.load_state_dict(self.net.state_dict())
 
     def policy(self):
-        """What policy.pt holds: see evaluate.Policy."""
-        f = self.flags
-        weights = {name: w.detach().cpu().clone() for name, w in self.net.mu.state_dict().items()}
+        """What policy.pt holds: see evaluate.Policy. The normalisation is folded into the first layer."""
+        f, net = self.flags, self.net
+        weights = {name: w.detach().cpu().clone() for name, w in net.mu_net.state_dict().items()}
+        weights["0.weight"] /= net.s_std.cpu()
+        weights["0.bias"] -= weights["0.weight"] @ net.s_mean.cpu()
         sizes = [OBS_DIM[f.task], *f.hidden_sizes, 4]
         return {"task": f.task, "symmetry": f.symmetry, "sizes": sizes, "output": "tanh", "weights": weights}
 
