@@ -1,85 +1,131 @@
-"""The paper's grid of runs (`sec:results`, data/paper/training_metrics.csv), on this machine or on a Slurm cluster.
+"""The paper's grid of runs (Sec. 5.1), on this machine or on a Slurm cluster.
 
-    python sweep.py --task p2p --seeds 5 --dry_run                   # the commands only, and what they will cost here
-    python sweep.py --task p2p --seeds 5 --jobs 2                    # runs them, two at a time
-    python sweep.py --task p2p --recipe robust --columns lambda=1.8 baseline --seeds 2 --epochs 10 --jobs 2
-    python sweep.py --status                                         # how far the whole grid is
-    python sweep.py --task p2p --seeds 5 --cluster slurm --partition cpu --time 600
+    python sweep.py --task p2p --dry_run            # the commands, and the cost
+    python sweep.py --task p2p --recipe robust --jobs 2       # two at a time
+    python sweep.py --task p2p --columns lambda=1.8 baseline --seeds 2
+    python sweep.py --task p2p --columns lambda=1.8 --recipe robust \\
+        --vary symmetry=none,gas num_demos=4,8      # four runs for each seed
+    python sweep.py --status                        # how far each run is
+    python sweep.py --cluster slurm --partition cpu --time 600
 
-A run is one command of ddpg_demoease.py or ppo_demoease.py with `--resume`, and one folder, DATA_DIR/NAME; what it
-prints goes to log.txt there. The same sweep started again skips what is finished, goes on with what was begun and
-starts what is missing, whatever killed it. Ctrl-C saves all running runs and stops. Columns are called as the paper's
-tables vary them: `lambda=1.8`, `demos=160`, `baseline`; what stands behind a lone `--` goes to every run as it is.
-On Slurm each run is a job of one array (submitit, requirements-slurm.txt): before its time is up or when it is
-preempted it saves its state, is queued again, and goes on.
+Columns are called as the paper's tables vary them: `lambda=1.8`, `demos=160`,
+`baseline`. `--vary` adds lists of values for any flag of the scripts, written
+as in the names of folders (`hidden_sizes=64x64,128x128`, `lr_decay=False`).
+
+A run is one command of ddpg_demoease.py or ppo_demoease.py, and the folder that
+this command makes by itself; what it prints goes to log.txt there. The same
+sweep started again skips what is done or running, goes on with what was begun
+and starts what is missing, whatever killed it. Ctrl-C saves all runs and stops.
+On Slurm each run is a job of one array (requirements-slurm.txt): before its
+time is up or when it is preempted it saves its state, is queued again, goes on.
 """
 
-import argparse
 import contextlib
 import csv
 import fcntl
+import importlib
+import itertools
+import json
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-import zlib
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tqdm import tqdm
 
 import logx
+from logx import flag
 
 HERE = Path(__file__).resolve().parent
-SCRIPTS = {"ddpg": "ddpg_demoease.py", "ppo": "ppo_demoease.py"}
-# Epochs and steps an epoch where no flag says otherwise (tab:reward, tab:reward2), and each recipe's symmetry.
-LENGTH = {"p2p": (250, 2000), "p2po": (500, 2500), "pnp": (50, 4000)}
-SYMMETRY = {"paper": "gas", "robust": "canonical"}  # where --symmetry says nothing
-OWN = "task recipe symmetry num_demos lambda_bc seed epochs steps_per_epoch name data_dir resume quiet quick".split()
+TASKS = ("p2p", "p2po", "pnp")
+SCRIPTS = {"ddpg": "ddpg_demoease", "ppo": "ppo_demoease"}
+NOT_VARIED = ("task", "seed", "name", "data_dir", "resume", "quick", "quiet")  # the sweep's own
 STOPPED = 130  # exit code of a run that was asked to stop, and saved its state
+EXIT = "sweep: exit code "  # how a line of log.txt begins
+HELD = "another process is running"  # how a run is refused whose folder is held: begun by a sweep that was killed
+
+
+@dataclass
+class Flags:
+    # which runs
+    task: tuple[str, ...] = flag(TASKS, "tasks", TASKS)
+    columns: tuple[str, ...] | None = flag(None, "lambda=X, demos=N, baseline; all of the task's", metavar="COLUMN")
+    vary: tuple[str, ...] | None = flag(None, "values of flags; every combination is run", metavar="FLAG=VALUE,...")
+    recipe: str = flag("paper", "the scripts' --recipe", ("paper", "robust"))
+    epochs: int | None = flag(None, "the scripts' --epochs; the recipe's", low=1)
+    seeds: int = flag(5, "seeds a column", low=1)
+    first_seed: int = flag(0, "the first of them", low=0)
+    data_dir: Path = flag(Path("data/runs"), "where run folders lie")
+    # what to do
+    jobs: int | None = flag(None, "runs at a time; 1 here, 256 on Slurm", low=1)
+    nice: int = flag(0, "lower priority of the runs on this machine", low=0, high=19)
+    dry_run: bool = flag(False, "print the commands and what they cost, and do nothing")
+    status: bool = flag(False, "print how far each run in data_dir is, and do nothing")
+    # on a cluster
+    cluster: str | None = flag(None, "submit the runs instead of running them here", ("slurm",))
+    partition: str | None = flag(None, "of Slurm", metavar="NAME")
+    time: int = flag(600, "of a job, before it is queued again", low=1, metavar="MINUTES")
+    mem_gb: int = flag(4, "of a job", low=1, metavar="GB")
+    signal_delay: int = flag(90, "before its time is up a job saves its state", low=1, metavar="SECONDS")
+
+
+# ---- a run -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Run:
-    """One run: its command and its folder."""
+class Job:
+    """One run: its folder, its environment steps, its command, and what decides its speed.
 
-    task: str
-    algo: str
-    N: int  # N_demos
+    It goes to Slurm's nodes by value: nothing of logx in it, which may not be importable there.
+    """
+
     folder: Path
-    flags: tuple  # of the script, as text
-    total: int  # environment steps
+    total: int
+    words: tuple = ()  # script and flags
+    kind: tuple = ()
 
     @property
     def command(self):
-        return [sys.executable, str(HERE / SCRIPTS[self.algo]), *self.flags, "--resume", "--quiet"]
+        script, *words = self.words
+        return [sys.executable, str(HERE / script), *words, "--resume", "--quiet"]
+
+    def start(self):
+        """Its process; what it prints goes to log.txt."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with open(self.folder / "log.txt", "a") as log:
+            return subprocess.Popen(self.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    def note_end(self, code):
+        with open(self.folder / "log.txt", "a") as log:
+            log.write(f"{EXIT}{code}\n")
+
+    def text(self, name):
+        """Of a file of the folder; empty where there is none."""
+        try:
+            return (self.folder / name).read_text(errors="replace")
+        except OSError:
+            return ""
+
+    def rows(self):
+        """progress.csv as dicts; columns differ by algorithm. A line that is still being written is left out."""
+        text = self.text("progress.csv")
+        return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
 
     def steps(self):
         """Environment steps done, by progress.csv; of these a part may have to be done again."""
         rows = self.rows()
         return int(rows[-1]["env_steps"]) if rows else 0
 
-    def rows(self):
-        try:
-            with open(self.folder / "progress.csv", newline="") as file:
-                rows = list(csv.DictReader(file))
-        except OSError:
-            return []
-        return [row for row in rows if row["seconds"] and row["eval_return"] is not None]  # whole lines only
-
-    def saved_last(self):
-        """Whether the checkpoint was saved after the last epoch was logged: for runs that were ended by hand."""
-        try:
-            saved, logged = (os.stat(self.folder / name).st_mtime_ns for name in ("checkpoint.pt", "progress.csv"))
-            return saved >= logged
-        except OSError:
-            return False
-
     def state(self):
-        """(waiting | queued | running | stopped | failed | done, the last error line where it failed)."""
+        """(waiting | queued | running | stopped | failed | done, the last line it said where it failed)."""
         try:
             with open(self.folder / "lock") as lock:
                 fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -87,35 +133,20 @@ class Run:
             return "running", ""
         except OSError:
             pass  # never begun
-        if queued(self.folder):
+        ask = ["squeue", "-h", "-j", self.text("slurm_job")]
+        if ask[-1] and shutil.which("squeue") and subprocess.run(ask, capture_output=True, text=True).stdout.strip():
             return "queued", ""
-        lines = log_lines(self.folder)
-        code = lines[-1].removeprefix(EXIT) if lines and lines[-1].startswith(EXIT) else ""
-        if code not in ("", "0", str(STOPPED)):
-            said = [line for line in lines[:-1] if line.strip() and not line.startswith(EXIT)]
-            return "failed", f"exit code {code}: {said[-1] if said else 'it said nothing'}"
-        if self.steps() >= self.total and (code == "0" or self.saved_last()):
+        steps, lines = self.steps(), self.text("log.txt").splitlines() or [""]
+        code = lines[-1].removeprefix(EXIT) if lines[-1].startswith(EXIT) else ""
+        said = [line for line in lines if line.strip() and not line.startswith(EXIT)] or ["it said nothing"]
+        logged, saved = (self.folder / name for name in ("progress.csv", "checkpoint.pt"))
+        if steps >= self.total and (  # by log.txt, or where it was run by hand
+            code == "0" or (saved.exists() and saved.stat().st_mtime_ns >= logged.stat().st_mtime_ns)
+        ):
             return "done", ""
-        return ("stopped" if self.steps() else "waiting"), ""
-
-
-EXIT = "sweep: exit code "
-
-
-def log_lines(folder):
-    try:
-        return (folder / "log.txt").read_text(errors="replace").splitlines()
-    except OSError:
-        return []
-
-
-def queued(folder):
-    """Whether Slurm still has the job that was submitted for a run."""
-    try:
-        job = (folder / "slurm_job").read_text()
-        return bool(subprocess.run(["squeue", "-h", "-j", job], capture_output=True, text=True).stdout.strip())
-    except OSError:  # never submitted, or not on the cluster
-        return False
+        if code not in ("", "0", str(STOPPED)) and HELD not in said[-1]:
+            return "failed", f"exit code {code}: {said[-1]}"
+        return ("stopped" if steps else "waiting"), ""
 
 
 # ---- the grid --------------------------------------------------------------------------------------------------------
@@ -123,65 +154,82 @@ def queued(folder):
 
 def columns(task):
     """The paper's columns of a task, each once: {name: (algo, N_demos, lambda_BC)}."""
-    found = {}
     with open(HERE / "data/paper/training_metrics.csv", newline="") as file:
-        for row in csv.DictReader(file):
-            if row["task"] == task:
-                value = {"lambda": row["lambda_bc"], "demos": row["num_demos"], "baseline": ""}[row["sweep"]]
-                name = row["sweep"] + f"={value}" * bool(value)
-                setting = (row["algo"], int(row["num_demos"]), float(row["lambda_bc"]))
-                if setting not in found.values():  # P&P's (400, 15) stands in both of its sweeps
-                    found[name] = setting
+        rows = [row for row in csv.DictReader(file) if row["task"] == task]
+    found = {}
+    for row in rows:
+        value = {"lambda": "=" + row["lambda_bc"], "demos": "=" + row["num_demos"], "baseline": ""}[row["sweep"]]
+        setting = row["algo"], int(row["num_demos"]), float(row["lambda_bc"])
+        if setting not in found.values():  # P&P's (400, 15) stands in both of its sweeps
+            found[row["sweep"] + value] = setting
     return found
 
 
-def grid(flags):
-    """The runs that the flags ask for, in the paper's order, seed by seed."""
-    runs = []
-    for task in flags.task:
-        for name, (algo, N, lam) in columns(task).items():
-            if flags.columns and name not in flags.columns:
-                continue
-            # P2P's "N_demos = 0, lambda = 1" is plain DDPG like the baseline: its seeds are others
-            first = flags.first_seed + (100 if (N, lam) == (0, 1) else 0)
-            symmetry = flags.symmetry or SYMMETRY[flags.recipe]
-            given = dict(symmetry=flags.symmetry, epochs=flags.epochs, steps_per_epoch=flags.steps_per_epoch)
-            own = dict(task=task, recipe=flags.recipe, num_demos=N, lambda_bc=f"{lam:g}", data_dir=flags.data_dir)
-            own |= {key: value for key, value in given.items() if value}
-            changes = [f"steps_per_epoch={flags.steps_per_epoch}"] * bool(flags.steps_per_epoch)
-            extra = "=".join(flags.extra).replace("--", "").replace("/", "_")
-            changes += [extra if len(extra) <= 80 else f"changes-{zlib.crc32(extra.encode()):08x}"] * bool(extra)
-            total = (flags.epochs or LENGTH[task][0]) * (flags.steps_per_epoch or LENGTH[task][1])
-            for seed in range(first, first + flags.seeds):
-                name = [task, algo, flags.recipe, f"N{N}", f"lambda{lam:g}", symmetry, *changes, f"seed{seed}"]
-                own |= dict(seed=seed, name="-".join(name))
-                words = [word for key, value in own.items() for word in (f"--{key}", str(value))]
-                runs.append(Run(task, algo, N, flags.data_dir / own["name"], (*words, *flags.extra), total))
-    return runs
+def combinations(vary):
+    """Every combination of the values of --vary: a list of {flag: value as text}."""
+    values = {}
+    for text in vary or ():
+        name, equals, given = text.partition("=")
+        if not equals or name in (*NOT_VARIED, *values):
+            raise logx.BadInput(f"--vary {text}: must be FLAG=VALUE,... once, and not of {', '.join(NOT_VARIED)}")
+        values[name] = given.split(",")
+    return [dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values())]
 
 
-def measured_rate(run):
-    """Environment steps a second, updates included, of a short run of the same kind on this machine, alone."""
-    with tempfile.TemporaryDirectory() as folder:
-        short = ["--name", "rate", "--data_dir", folder, "--epochs", "2", "--eval_every", "0"]
-        if run.algo == "ddpg":
-            short += ["--steps_per_epoch", "100", "--start_steps", "0", "--update_after", "0"]
+def as_words(cls, setting):
+    """{flag: value as text}, as in a folder's name, as the command line of a script whose flags are `cls`."""
+    words = []
+    for name, value in setting.items():
+        if value == "False":
+            words += [] if getattr(cls, name, None) is False else [f"--no-{name}"]
+        elif value == "True":
+            words += [f"--{name}"]
         else:
-            short += ["--clone_iters", "0"]
-        short += ["--num_demos", str(min(run.N, 4))]
-        done = subprocess.run(run.command + short, env=environment(), capture_output=True, text=True)
-        if done.returncode:  # bad input: said now, before anything is begun
-            print(done.stderr.strip(), file=sys.stderr)
-            raise SystemExit(done.returncode)
-        first, second = replace(run, folder=Path(folder) / "rate").rows()
-    return (int(second["env_steps"]) - int(first["env_steps"])) / (float(second["seconds"]) - float(first["seconds"]))
+            words += [f"--{name}", *(value.split("x") if re.fullmatch(r"\d+(x\d+)+", value) else [value])]
+    return words
 
 
-def rates(runs):
-    """{run: environment steps a second}, measured once for each task, with and without demonstrations."""
-    kinds = {(run.task, run.N > 0): run for run in reversed(runs)}
-    measured = {kind: measured_rate(run) for kind, run in tqdm(kinds.items(), "measuring", leave=False, disable=None)}
-    return {run: measured[run.task, run.N > 0] for run in runs}
+def grid(flags):
+    """The jobs that the flags ask for, in the paper's order, seed by seed, each once. Raises logx.BadInput."""
+    jobs = {}
+    for task in flags.task:
+        chosen = [setting for name, setting in columns(task).items() if name in (flags.columns or [name])]
+        for (algo, N, lam), varied in itertools.product(chosen, combinations(flags.vary)):
+            script = importlib.import_module(SCRIPTS[algo])  # here, since torch takes seconds
+            setting = {"task": task, "recipe": flags.recipe, "num_demos": f"{N}", "lambda_bc": f"{lam:g}"}
+            setting |= {"epochs": f"{flags.epochs}"} if flags.epochs else {}
+            words = as_words(script.Flags, setting | varied | {"data_dir": str(flags.data_dir)})
+            try:
+                asked = logx.parse_flags(script.Flags, "", words)
+                # P2P's "N_demos = 0, lambda = 1" is plain DDPG like the baseline: its seeds are others
+                first = flags.first_seed + 100 * ((task, asked.num_demos, asked.lambda_bc) == ("p2p", 0, 1))
+                for seed in range(first, first + flags.seeds):
+                    f = script.resolve(replace(asked, seed=seed))
+                    command = (f"{SCRIPTS[algo]}.py", *words, "--seed", f"{seed}")
+                    kind = (algo, task, f.recipe, f.variant, bool(f.num_demos))
+                    folder = flags.data_dir / f.name
+                    jobs[folder] = Job(folder, f.epochs * f.steps_per_epoch, command, kind)
+            except logx.BadInput as error:
+                raise logx.BadInput(f"{SCRIPTS[algo]}.py: {error}") from None
+    return list(jobs.values())
+
+
+def rates(jobs):
+    """{job: environment steps a second}, updates included, of a short run of the same kind here, alone."""
+    measured = {}
+    for kind, job in tqdm({job.kind: job for job in jobs}.items(), "measuring", leave=False, disable=None):
+        algo, *_, demos = kind
+        short = ["--epochs", "2", "--eval_every", "0", "--clone_iters", "0", "--num_demos", "4" if demos else "0"]
+        short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []
+        with tempfile.TemporaryDirectory() as folder:
+            words = (*job.words, *short, "--data_dir", folder, "--name", "rate")
+            job = replace(job, folder=Path(folder) / "rate", words=words)
+            done = subprocess.run(job.command, capture_output=True, text=True)
+            if done.returncode:
+                raise logx.BadInput(done.stderr)
+            steps, seconds = ([float(row[name]) for row in job.rows()] for name in ("env_steps", "seconds"))
+        measured[kind] = (steps[1] - steps[0]) / (seconds[1] - seconds[0])
+    return {job: measured[job.kind] for job in jobs}
 
 
 def hours(seconds):
@@ -191,66 +239,46 @@ def hours(seconds):
 # ---- this machine ----------------------------------------------------------------------------------------------------
 
 
-def environment():
-    return os.environ | {"OMP_NUM_THREADS": "1"}
-
-
-def start(run):
-    """The run's process; what it prints goes to log.txt."""
-    run.folder.mkdir(parents=True, exist_ok=True)
-    with open(run.folder / "log.txt", "a") as log:
-        return subprocess.Popen(run.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment())
-
-
-def ended(run, code):
-    with open(run.folder / "log.txt", "a") as log:
-        log.write(f"{EXIT}{code}\n")
-
-
-def run_here(runs, jobs):
-    """Runs them, `jobs` at a time, a progress line each. After SIGINT or SIGTERM all save their state and end.
-
-    Returns whether it was stopped so.
-    """
-    asked, told = [], set()
+def run_here(jobs, at_a_time):
+    """Runs them. After SIGINT or SIGTERM all save their state and end. Returns whether it was stopped so."""
+    asked, told = [], []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: asked.append(number))
-    waiting, places, active = list(runs), list(range(jobs)), {}
+    waiting, active, steps = list(jobs), {}, {job: job.steps() for job in jobs}
+    bar = tqdm(total=sum(job.total for job in jobs), initial=sum(steps.values()), unit="step", disable=None)
     while active or (waiting and not asked):
-        if waiting and places and not asked:
-            run, place = waiting.pop(0), places.pop(0)
-            line = dict(total=run.total, initial=run.steps(), desc=run.folder.name, unit="step", smoothing=0.02)
-            active[run] = start(run), tqdm(position=place, leave=False, disable=None, **line), place
-        for run, (process, bar, place) in list(active.items()):
-            if asked and run not in told:
-                process.terminate()
-                told.add(run)
-            bar.update(run.steps() - bar.n)
+        if waiting and len(active) < at_a_time and not asked:
+            job = waiting.pop(0)
+            active[job] = job.start()
+        if asked and not told:
+            told = [process.terminate() for process in active.values()]
+        for job, process in list(active.items()):
             if process.poll() is not None:
-                del active[run]
-                places.append(place)
-                bar.close()
-                ended(run, STOPPED if asked and process.returncode < 0 else process.returncode)
-                state, error = run.state()
-                tqdm.write(f"{state:8} {run.folder} {error}".rstrip())
+                del active[job]
+                job.note_end(STOPPED if asked and process.returncode < 0 else process.returncode)
+                state, error = job.state()
+                bar.write(f"{state:8} {job.folder} {error}".rstrip())
+            steps[job] = job.steps()
+        bar.update(sum(steps.values()) - bar.n)
         time.sleep(0.2)
+    bar.close()
     return bool(asked)
 
 
 # ---- Slurm -----------------------------------------------------------------------------------------------------------
 
 
-class Job:
-    """One run as a job of submitit, which calls it on the node, and `checkpoint` before its time there is up."""
+class SlurmJob:
+    """A Job as submitit's, which calls it on the node, and `checkpoint` before its time there is up."""
 
-    def __init__(self, run):
-        self.run, self.process = run, None
+    def __init__(self, job):
+        self.job, self.process = job, None
 
     def __call__(self):
-        self.process = start(self.run)
-        ended(self.run, self.process.wait())
+        self.process = self.job.start()
+        self.job.note_end(self.process.wait())
         if self.process.returncode:
-            raise RuntimeError(f"{self.run.folder}: exit code {self.process.returncode}, see log.txt there")
+            raise RuntimeError(f"{self.job.folder}: exit code {self.process.returncode}, see log.txt there")
 
     def checkpoint(self):
         import submitit
@@ -258,127 +286,95 @@ class Job:
         with contextlib.suppress(ProcessLookupError, ChildProcessError):  # it has ended already
             os.kill(self.process.pid, signal.SIGTERM)  # it saves its state
             os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # Popen.wait, interrupted by this, is locked
-        return submitit.helpers.DelayedSubmission(Job(self.run))
+        return submitit.helpers.DelayedSubmission(SlurmJob(self.job))
 
 
-def submit(runs, flags):
-    """Hands the runs to submitit as one job array. Raises ValueError where there is no submitit or no cluster."""
+def submit(jobs, flags):
+    """Hands the jobs to submitit as one array. Raises logx.BadInput where there is no submitit or no cluster."""
     try:
         import submitit
-    except ImportError:
-        raise ValueError("submitit is not installed (pip install -r requirements-slurm.txt)") from None
-    folder = flags.data_dir / "slurm"
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        executor = submitit.AutoExecutor(folder, cluster=flags.cluster, slurm_max_num_timeout=10_000)
-        executor.update_parameters(name="demo-ease", timeout_min=flags.time, cpus_per_task=1, mem_gb=flags.mem_gb)
-        executor.update_parameters(slurm_partition=flags.partition, slurm_array_parallelism=flags.jobs or 256,
+
+        folder = flags.data_dir / "slurm"
+        folder.mkdir(parents=True, exist_ok=True)
+        executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=10_000)
+        executor.update_parameters(name="demo-ease", timeout_min=flags.time, cpus_per_task=1, mem_gb=flags.mem_gb,
+                                   slurm_partition=flags.partition, slurm_array_parallelism=flags.jobs or 256,
                                    slurm_signal_delay_s=flags.signal_delay,
                                    slurm_additional_parameters={"requeue": True})  # fmt: skip
         with executor.batch():
-            jobs = [executor.submit(Job(run)) for run in runs]
+            submitted = [executor.submit(SlurmJob(job)) for job in jobs]
+    except ImportError:
+        raise logx.BadInput("--cluster slurm: needs submitit (pip install -r requirements-slurm.txt)") from None
     except (RuntimeError, submitit.core.utils.FailedJobError) as error:  # no Slurm here; or it refused
-        raise ValueError(" ".join(str(error).split())) from None
-    for run, job in zip(runs, jobs, strict=True):
-        if flags.cluster == "slurm":
-            run.folder.mkdir(parents=True, exist_ok=True)
-            (run.folder / "slurm_job").write_text(job.job_id)
-        print(f"job {job.job_id}  {run.folder}")
-
-
-def fail(message):
-    print(f"sweep.py: error: {message}", file=sys.stderr)
-    return 2
+        raise logx.BadInput(f"--cluster slurm: {error}") from None
+    for job, its in zip(jobs, submitted, strict=True):
+        job.folder.mkdir(parents=True, exist_ok=True)
+        (job.folder / "slurm_job").write_text(its.job_id)
+        print(f"job {its.job_id}  {job.folder}")
 
 
 # ---- main ------------------------------------------------------------------------------------------------------------
 
 
-def parse(argv):
-    parser = argparse.ArgumentParser(
-        description=__doc__, usage=argparse.SUPPRESS, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--task", nargs="+", choices=LENGTH, default=list(LENGTH), metavar="TASK",
-                        help="p2p, p2po, pnp; all by default")  # fmt: skip
-    parser.add_argument("--columns", nargs="+", metavar="COLUMN", help="lambda=X, demos=N, baseline; all by default")
-    parser.add_argument("--seeds", type=int, default=5, help="seeds a column (5)")
-    parser.add_argument("--first_seed", type=int, default=0)
-    parser.add_argument("--recipe", choices=("paper", "robust"), default="paper")
-    parser.add_argument("--symmetry", choices=("none", "gas", "so2", "canonical"), help="the recipe's by default")
-    parser.add_argument("--epochs", type=int, help="the paper's by default")
-    parser.add_argument("--steps_per_epoch", type=int)
-    parser.add_argument("--data_dir", type=logx.path, default=Path("data/runs"))
-    parser.add_argument("--jobs", type=int, help="runs at a time (1 here, 256 on Slurm)")
-    parser.add_argument("--dry_run", action="store_true", help="print the commands and what they cost, and do nothing")
-    parser.add_argument("--status", action="store_true", help="print how far each run is")
-    parser.add_argument("--cluster", choices=("slurm", "local"), help="submit; local: the same without Slurm")
-    parser.add_argument("--partition", help="of Slurm")
-    parser.add_argument("--time", type=int, default=600, metavar="MINUTES", help="of a job, before it is queued again")
-    parser.add_argument("--mem_gb", type=int, default=4, help="of a job, in GB")
-    parser.add_argument("--signal_delay", type=int, default=90, metavar="SECONDS",
-                        help="before its time is up a job is told to save its state")  # fmt: skip
-    own = argv[: argv.index("--")] if "--" in argv else argv
-    flags = parser.parse_args(own)
-    flags.extra = argv[len(own) + 1 :]
-    for name in ("seeds", "epochs", "steps_per_epoch", "jobs", "time", "mem_gb", "signal_delay"):
-        if getattr(flags, name) is not None and getattr(flags, name) < 1:
-            parser.error(f"--{name} {getattr(flags, name)}: must be at least 1")
+def parse(argv=None):
+    """The flags of a command line. Raises logx.BadInput."""
+    flags = logx.parse_flags(Flags, __doc__, argv)
     if flags.time * 60 < flags.signal_delay + 60:  # Slurm may signal a minute early: then there is no job to hear it
-        parser.error(f"--time {flags.time}: must be at least --signal_delay, {flags.signal_delay} s, and a minute more")
+        raise logx.BadInput(f"--time {flags.time}: must be --signal_delay, {flags.signal_delay} s, and a minute more")
     if flags.data_dir.exists() and not flags.data_dir.is_dir():
-        parser.error(f"--data_dir {flags.data_dir}: is a file, a folder is expected")
-    if flags.first_seed < 0:
-        parser.error(f"--first_seed {flags.first_seed}: must be at least 0")
-    for word in flags.extra:
-        if word.removeprefix("--").split("=")[0] in OWN:
-            parser.error(f"-- {word}: is sweep.py's own; allowed behind -- are the scripts' other flags")
+        raise logx.BadInput(f"--data_dir {flags.data_dir}: is a file, a folder is expected")
     known = {name: None for task in flags.task for name in columns(task)}
     for name in flags.columns or ():
         if name not in known:
-            parser.error(f"--columns {name}: not a column of {' '.join(flags.task)}, which have {' '.join(known)}")
+            raise logx.BadInput(f"--columns {name}: {' '.join(flags.task)} has {' '.join(known)}")
+    if flags.cluster:
+        flags.data_dir = flags.data_dir.absolute()
     return flags
 
 
+def print_status(jobs, data_dir):
+    """How far each run in data_dir is, of the grid or not, and how many of the grid's are not begun."""
+    begun = {job.folder: job for job in jobs if job.folder.exists()}
+    for file in sorted(data_dir.glob("*/config.json")):
+        try:
+            config = json.loads(file.read_text())
+            begun.setdefault(file.parent, Job(file.parent, config["epochs"] * config["steps_per_epoch"]))
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            print(f"{file}: no run's settings ({logx.one_line(error)})", file=sys.stderr)
+    count = Counter()
+    for job in begun.values():
+        (state, error), rows, to_come = job.state(), job.rows(), ""
+        count[state] += 1
+        if rows and state in ("running", "stopped"):
+            to_come = hours((job.total - job.steps()) / job.steps() * float(rows[-1]["seconds"])) + " to come"
+        print(f"{state:8} {100 * job.steps() / job.total:5.1f} %  {to_come:15} {job.folder}  {error}".rstrip())
+    missing = sum(job.folder not in begun for job in jobs)
+    print(", ".join(f"{n} {state}" for state, n in sorted(count.items())) or f"{data_dir}: no runs", end="")
+    print(f"; of the {len(jobs)} runs asked for, {missing} are not begun")
+
+
 def main(argv=None):
-    flags = parse(sys.argv[1:] if argv is None else argv)
-    if flags.cluster:
-        flags.data_dir = flags.data_dir.absolute()
-    runs = grid(flags)
-    states = {run: run.state() for run in runs}
+    flags = parse(argv)
+    jobs = grid(flags)
     if flags.status:
-        for run, (state, error) in states.items():
-            rows, left = run.rows(), ""
-            if rows and state in ("running", "stopped"):
-                left = (run.total - run.steps()) / run.steps() * float(rows[-1]["seconds"])
-                left = f"{hours(left)} left"
-            print(f"{state:8} {100 * run.steps() / run.total:5.1f} %  {left:12} {run.folder}  {error}".rstrip())
-        print(", ".join(f"{[state for state, _ in states.values()].count(name)} {name}"
-                        for name in ("waiting", "queued", "running", "stopped", "failed", "done")))  # fmt: skip
-        return 0
-    todo = [run for run in runs if states[run][0] not in ("done", "running", "queued")]
-    rate = rates(todo)
-    cost = {run: max(0, run.total - run.steps()) / rate[run] for run in todo}
-    for run in runs:
-        command = shlex.join(["python", SCRIPTS[run.algo], *run.command[2:]])
-        print(f"{states[run][0]:8} {hours(cost[run]) if run in cost else '':>8}  {command}")
-    jobs = flags.jobs or 1
-    total = sum(cost.values())
-    print(f"{len(runs)} runs, {len(todo)} to do: {total / 3600:.1f} core-hours at the rates measured here"
-          + f" (about {hours(total / jobs)} with --jobs {jobs})" * (not flags.cluster))  # fmt: skip
+        return print_status(jobs, flags.data_dir)
+    states = {job: job.state()[0] for job in jobs}
+    todo = [job for job in jobs if states[job] not in ("done", "running", "queued")]
+    rate = rates(todo) if flags.dry_run else {}
+    cost = {job: max(0, job.total - job.steps()) / rate[job] for job in rate}
+    for job in jobs:
+        print(f"{states[job]:8} {hours(cost[job]) if job in cost else '':>8}  {shlex.join(['python', *job.words])}")
+    print(f"{len(jobs)} runs, {len(todo)} to do"
+          + f": {sum(cost.values()) / 3600:.1f} core-hours at the rates measured here" * flags.dry_run)  # fmt: skip
     if flags.dry_run or not todo:
         return 0
-    if flags.cluster == "local" and len(todo) > os.cpu_count():
-        return fail(f"--cluster local: would start all {len(todo)} runs on {os.cpu_count()} cores; use --jobs instead")
     if flags.cluster:
-        try:
-            submit(todo, flags)
-        except ValueError as error:
-            return fail(f"--cluster {flags.cluster}: {error}")
-        return 0
-    if run_here(todo, jobs):
+        return submit(todo, flags)
+    os.nice(flags.nice)
+    if run_here(todo, flags.jobs or 1):
         return STOPPED
-    return 0 if all(run.state()[0] == "done" for run in todo) else 1
+    return 0 if all(job.state()[0] in ("done", "running") for job in todo) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    logx.run_script(main)
