@@ -301,10 +301,7 @@ class Learner:
     def act(self, s):
         """pi_mu of one observation, as the networks see it: (4,) numpy."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
-        a = self.actor.pi(torch.from_numpy(s)).numpy()
-        if not np.isfinite(a).all():
-            raise logx.NotFinite("the actor gives NaN; go on from the last checkpoint, or begin anew")
-        return a
+        return self.actor.pi(torch.from_numpy(s)).numpy()
 
     def decay_learning_rates(self, remaining):
         """Linearly to 0 over the second half of the run. remaining: the fraction of it that is still to come."""
@@ -387,13 +384,8 @@ class Learner:
         self.actor.load_state_dict(self.net.state_dict())
 
     def policy(self):
-        """What policy.pt holds: see evaluate.Policy. The normalisation is folded into the first layer."""
-        f, net = self.flags, self.net
-        weights = {name: w.detach().cpu().clone() for name, w in net.mu_net.state_dict().items()}
-        weights["0.weight"] /= net.s_std.cpu()
-        weights["0.bias"] -= weights["0.weight"] @ net.s_mean.cpu()
-        sizes = [OBS_DIM[f.task], *f.hidden_sizes, 4]
-        return {"task": f.task, "symmetry": f.symmetry, "sizes": sizes, "output": "tanh", "weights": weights}
+        """What policy.pt holds."""
+        return evaluate.pack_policy(self.flags, self.net, "tanh")
 
 
 # ---- training loop ---------------------------------------------------------------------------------------------------

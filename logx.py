@@ -310,6 +310,8 @@ class Replayable(gymnasium.Wrapper):
         return self._s, info
 
     def step(self, action):
+        if not np.isfinite(action).all():
+            raise NotFinite("the actor gives NaN; go on from the last checkpoint with --resume, or begin anew")
         s2, r, terminated, truncated, info = self.env.step(action)
         self.episode.append((self._s, action, r, s2, terminated, truncated))
         self._s = s2

@@ -277,10 +277,7 @@ class Learner:
     def act(self, s):
         """mu and sigma of one observation, (4,) numpy each."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
-        mu, sigma = self.actor.mu(torch.from_numpy(s)).numpy(), self.actor.log_std.exp().numpy()
-        if not np.isfinite(mu).all():
-            raise logx.NotFinite("the actor gives NaN; go on from the last checkpoint, or begin anew")
-        return mu, sigma
+        return self.actor.mu(torch.from_numpy(s)).numpy(), self.actor.log_std.exp().numpy()
 
     def V(self, s):
         """V_nu(s), with clip_value within possible returns."""
@@ -379,15 +376,8 @@ class Learner:
         self.actor.load_state_dict(self.net.state_dict())
 
     def policy(self):
-        """What policy.pt holds: see evaluate.Policy. The normalisation is folded into the first layer."""
-        f, net = self.flags, self.net
-        weights = {name: w.detach().cpu().clone() for name, w in net.mu_net.state_dict().items()}
-        of_s = weights["0.weight"][:, : OBS_DIM[f.task]]
-        of_s /= net.s_std.cpu()
-        weights["0.bias"] -= of_s @ net.s_mean.cpu()
-        sizes = [net.mu_net[0].in_features, *f.hidden_sizes, 4]
-        return {"task": f.task, "symmetry": f.symmetry, "sizes": sizes, "output": "linear",
-                "grasp_input": f.grasp_input, "weights": weights}  # fmt: skip
+        """What policy.pt holds."""
+        return evaluate.pack_policy(self.flags, self.net, "linear")
 
 
 # ---- training loop ---------------------------------------------------------------------------------------------------
