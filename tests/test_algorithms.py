@@ -1,0 +1,536 @@
+"""What holds for both algorithm scripts: runs, resumes, curves, flags and losses. Most runs are in a scripted world,
+whose episodes are short and end in every way."""
+
+import csv
+import json
+import math
+import signal
+import threading
+from dataclasses import fields
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import ddpg_demoease as ddpg
+import evaluate
+import gas
+import logx
+import pid_demo
+import ppo_demoease as ppo
+from kinova_env import OBS_DIM
+
+SCRIPTS = {"ddpg": ddpg, "ppo": ppo}
+COMMON = dict(task="p2p", hidden_sizes=(16, 16), epochs=3, steps_per_epoch=40, num_demos=0, lambda_bc=0.0, seed=3,
+              batch_size=16, demo_batch_size=8, eval_every=0, checkpoint_every=1, quiet=True)  # fmt: skip
+TINY = {
+    ddpg: COMMON | dict(max_ep_len=40, start_steps=20, update_after=60, update_every=7, replay_size=1000),
+    ppo: COMMON | dict(max_ep_len=40, train_iters=4),
+}
+
+
+@pytest.fixture(params=SCRIPTS.values(), ids=SCRIPTS.keys())
+def script(request):
+    return request.param
+
+
+# ---- a scripted world ------------------------------------------------------------------------------------------------
+
+
+class Scripted(gymnasium.Env):
+    """What train() needs of an environment; all follows from the seed and the actions. `steps` remembers every step,
+    at_step(n) is called in the n-th."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (22,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (4,), np.float32)
+
+    def __init__(self, at_step=None):
+        self.steps, self.at_step = [], at_step
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = self.np_random.normal(size=22).astype(np.float32)
+        self.to_go = int(self.np_random.integers(3, 25))
+        self.end = ("timeout", "success", "self")[self.np_random.integers(3)]
+        return self.s, {}
+
+    def step(self, a):
+        assert a.dtype == np.float32 and a.shape == (4,) and np.isfinite(a).all()
+        s, self.to_go = self.s, self.to_go - 1
+        self.s = (0.95 * s + 0.2 * np.resize(a, 22)).astype(np.float32)
+        end = "" if self.to_go else self.end
+        r = float(self.s[5]) + (10 if end == "success" else 0)
+        terminated, truncated = end in ("success", "self"), end == "timeout"
+        self.steps.append(SimpleNamespace(s=s, a=a.copy(), r=r, s2=self.s, terminated=terminated, truncated=truncated,
+                                          end=end))  # fmt: skip
+        if self.at_step:
+            self.at_step(len(self.steps))
+        info = {"is_success": end == "success", "collision": "self" if end == "self" else ""}
+        return self.s, r, terminated, truncated, info
+
+
+def scripted_run(script, data_dir, name, at_step=None, recorded=None, **changes):
+    """train() in a Scripted world with the TINY flags and changes. recorded: the demonstrations. Returns the run's
+    folder, the world's steps, and what the run raised."""
+    flags = script.Flags(**TINY[script] | dict(name=name, data_dir=str(data_dir)) | changes)
+    return run_flags(script, flags, at_step, recorded)
+
+
+def run_flags(script, flags, at_step=None, recorded=None):
+    env, error = Scripted(at_step), None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(script, "gymnasium", SimpleNamespace(make=lambda *args, **kwargs: env))
+        if recorded:
+            patch.setattr(pid_demo, "demonstrations", lambda flags: (recorded, len(recorded["rew"])))
+        try:
+            script.train(flags)
+        except (Exception, KeyboardInterrupt) as stopped:
+            error = stopped
+    return SimpleNamespace(folder=Path(flags.data_dir, str(flags.name)), steps=env.steps, error=error)
+
+
+def interrupt_at(step, number=signal.SIGINT):
+    return lambda n: signal.raise_signal(number) if n == step else None
+
+
+@pytest.fixture
+def world(tmp_path):
+    """world(script, name, **flags): a scripted run that comes to its end."""
+
+    def run(script, name, **changes):
+        done = scripted_run(script, tmp_path, name, **changes)
+        if done.error:
+            raise done.error
+        return done
+
+    return run
+
+
+def states(n, obs_dim=22, seed=0):
+    """Random states (n, obs_dim) with sines and cosines that fit the angles."""
+    rng = np.random.default_rng(seed)
+    s = rng.normal(size=(n, obs_dim))
+    s[:, :4] = rng.uniform(-math.pi, math.pi, (n, 4))
+    s[:, 4:8], s[:, 8:12] = np.sin(s[:, :4]), np.cos(s[:, :4])
+    return s.astype(np.float32)
+
+
+DEMO_ENDS = [("success", 6), ("self", 4), ("timeout", 5), ("left its sector", 3)]
+
+
+def demo_arrays():
+    """Four demonstrations, one of each end, as pid_demo.record gives them."""
+    rng, lengths = np.random.default_rng(5), [length for _, length in DEMO_ENDS]
+    n, last = sum(lengths), np.cumsum(lengths) - 1
+    demos = dict(obs=states(n, seed=1), act=rng.uniform(-1, 1, (n, 4)).astype(np.float32), rew=rng.normal(size=n),
+                 obs2=states(n, seed=2), terminated=np.zeros(n, bool), truncated=np.zeros(n, bool),
+                 episode=np.repeat(np.arange(4), lengths), partition=np.zeros(4, int), length=np.array(lengths),
+                 success=np.array([True, False, False, False]))  # fmt: skip
+    demos["return"] = np.zeros(4)
+    demos["terminated"][last[:2]] = True
+    demos["truncated"][last[2:]] = True
+    return demos
+
+
+def rows_of(path):
+    return list(csv.DictReader(path.open()))
+
+
+def curves(folder):
+    """episodes.csv, progress.csv but for its seconds, and policy.pt: what equal runs share byte by byte."""
+    progress = rows_of(folder / "progress.csv")
+    for row in progress:
+        row.pop("seconds")
+    return (folder / "episodes.csv").read_bytes(), progress, (folder / "policy.pt").read_bytes()
+
+
+def checkpoint(folder):
+    return torch.load(folder / "checkpoint.pt", weights_only=True)
+
+
+def demonstrated(script, folder):
+    """The rows of B_d in a run's checkpoint."""
+    return checkpoint(folder)["B_d"]["rows"] if script is ddpg else checkpoint(folder)["demo_rows"]
+
+
+# ---- the same run ----------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(script, world):
+    one, again, other = world(script, "a"), world(script, "b"), world(script, "c", seed=4)
+    assert curves(one.folder) == curves(again.folder)
+    assert not np.array_equal(one.steps[0].s, other.steps[0].s)  # the episodes too, not the exploration alone
+    assert all(x != y for x, y in zip(curves(one.folder), curves(other.folder), strict=True))
+
+
+RESUMED = {
+    "paper": dict(recipe="paper", num_demos=4, lambda_bc=1.0, recorded=demo_arrays()),
+    "robust": dict(recipe="robust", num_demos=4, lambda_bc=1.0, recorded=demo_arrays(), symmetry="so2", clone_iters=2),
+}
+
+
+@pytest.mark.parametrize("recipe", RESUMED)
+def test_a_run_that_is_interrupted_and_resumed_equals_one_that_never_stopped(script, recipe, world, tmp_path):
+    """At 5 nothing is learned yet, 63 is amid an epoch after an update, at 80 an epoch ends, 119 is the last but one.
+    On-policy, demonstrations still open epochs."""
+    whole = world(script, "whole", **RESUMED[recipe])
+    for number, at in zip((signal.SIGINT, signal.SIGTERM) * 2, (5, 63, 80, 119), strict=True):
+        cut = scripted_run(script, tmp_path, f"at {at}", interrupt_at(at, number), **RESUMED[recipe])
+        assert isinstance(cut.error, KeyboardInterrupt) and "--resume" in str(cut.error)
+        assert len(cut.steps) == at == checkpoint(cut.folder)["t"]
+        again = world(script, f"at {at}", resume=True, **RESUMED[recipe] | dict(recorded=None))  # they are saved
+        assert curves(again.folder) == curves(whole.folder)
+
+
+def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(script, world, capsys):
+    """--resume FOLDER --epochs N: all other flags are those on record."""
+    whole, first = world(script, "whole"), world(script, "a", epochs=2)
+    asked = script.Flags(resume=str(first.folder), epochs=3)
+    again = run_flags(script, asked)
+    assert not again.error and len(again.steps) < 120 and curves(first.folder) == curves(whole.folder)
+    finished = run_flags(script, asked)
+    assert not finished.error and finished.steps == [] and "finished" in capsys.readouterr().out
+    assert curves(first.folder) == curves(whole.folder)
+
+
+def test_without_demonstrations_it_is_the_plain_algorithm_whatever_lambda_is(script, world):
+    plain, other = world(script, "a"), world(script, "b", lambda_bc=5.0)
+    assert curves(plain.folder) == curves(other.folder)
+    row = rows_of(other.folder / "progress.csv")[-1]
+    assert row["L_A"] == row["L_O"] != "" and row["demo_env_steps"] == "0"
+    assert row["L_BC"] == row["mask_fraction"] == row["bc_relative_error"] == ""
+
+
+def test_evaluation_is_logged_and_changes_nothing_in_the_run(script, world):
+    silent, evaluated = world(script, "a"), world(script, "b", eval_every=2, eval_trials=1)
+    rows = rows_of(evaluated.folder / "progress.csv")
+    measured = [row["epoch"] for row in rows if row["eval_success"] != "" != row["eval_return"]]
+    assert measured == ["2", "3"]  # every second, and the last
+    assert curves(silent.folder)[::2] == curves(evaluated.folder)[::2]
+
+
+# ---- demonstrations --------------------------------------------------------------------------------------------------
+
+
+def test_gas_maps_a_quarter_of_the_demonstrations_to_all_sectors_and_a_file_of_them_gives_the_same_run(
+    script, world, tmp_path, monkeypatch
+):
+    settings = dict(num_demos=4, lambda_bc=1.8, gains="fast", symmetry="gas", epochs=2)
+    recorded = world(script, "recorded", **settings)
+    rows = demonstrated(script, recorded.folder)
+    steps = int(rows_of(recorded.folder / "progress.csv")[0]["demo_env_steps"])
+    assert len(rows) == 4 * steps
+    for k in range(4):
+        image = rows[k * steps : (k + 1) * steps]
+        assert torch.equal(image[:, 22:27], rows[:steps, 22:27])
+        torch.testing.assert_close(image[:, :22], gas.phi(rows[:steps, :22], k), rtol=0, atol=1e-5)
+
+    file = tmp_path / "demos.npz"
+    argv = "pid_demo.py --task p2p --record 4 --gains fast --symmetry gas --seed 3 --out"
+    monkeypatch.setattr("sys.argv", [*argv.split(), str(file)])
+    pid_demo.main()
+    read = world(script, "read", **settings | dict(demos=str(file)))
+    assert curves(read.folder) == curves(recorded.folder)
+
+
+def test_canonical_demonstrations_are_stored_in_the_arms_own_frame(script, world):
+    stored = {}
+    for symmetry in ("none", "canonical"):
+        run = world(script, symmetry, symmetry=symmetry, num_demos=4, lambda_bc=1.0, recorded=demo_arrays(), epochs=1)
+        stored[symmetry] = demonstrated(script, run.folder)
+    assert torch.equal(stored["canonical"][:, :22], torch.from_numpy(gas.canonical(demo_arrays()["obs"])))
+    assert torch.equal(stored["none"][:, :22], torch.from_numpy(demo_arrays()["obs"]))
+    assert torch.equal(stored["canonical"][:, 22:27], stored["none"][:, 22:27])
+
+
+# ---- curves ----------------------------------------------------------------------------------------------------------
+
+
+def test_epochs_cut_no_episode(script, world):
+    run = world(script, "a", steps_per_epoch=10, epochs=12, checkpoint_every=9)
+    rows, ends = rows_of(run.folder / "episodes.csv"), [t + 1 for t, x in enumerate(run.steps) if x.end]
+    assert [int(row["env_steps"]) for row in rows] == ends and len(ends) >= 7
+    assert [int(row["length"]) for row in rows] == np.diff([0, *ends]).tolist()
+    assert max(int(row["length"]) for row in rows) > 10
+    assert [int(row["episode"]) for row in rows] == list(range(1, len(ends) + 1))
+    for row, begin, end in zip(rows, [0, *ends[:-1]], ends, strict=True):
+        last = run.steps[end - 1].end
+        assert float(row["return"]) == pytest.approx(sum(x.r for x in run.steps[begin:end]), abs=1e-6)
+        assert row["success"] == str(int(last == "success")) and row["collision"] == ("self" if last == "self" else "")
+
+
+def test_a_row_of_progress_averages_its_own_epoch(script, world, monkeypatch):
+    logged, log_updates, log_epoch = [[]], logx.RunFolder.log_updates, logx.RunFolder.log_epoch
+    monkeypatch.setattr(logx.RunFolder, "log_updates", lambda self, m: logged[-1].append(m) or log_updates(self, m))
+    monkeypatch.setattr(logx.RunFolder, "log_epoch", lambda *args: log_epoch(*args) or logged.append([]))
+    run = world(script, "a", steps_per_epoch=20, epochs=6, num_demos=4, lambda_bc=1.0, recorded=demo_arrays())
+    episodes, progress = rows_of(run.folder / "episodes.csv"), rows_of(run.folder / "progress.csv")
+    assert [(row["epoch"], row["env_steps"]) for row in progress] == [(f"{n}", f"{20 * n}") for n in range(1, 7)]
+    for row, measured in zip(progress, logged[:-1], strict=True):
+        end = int(row["env_steps"])
+        of_epoch = [e for e in episodes if end - 20 < int(e["env_steps"]) <= end]
+        for column, name in (("EpRet", "return"), ("EpLen", "length"), ("Success", "success")):
+            values = [float(e[name]) for e in of_epoch]
+            assert row[column] == "" if not values else float(row[column]) == pytest.approx(np.mean(values), abs=1e-6)
+        assert (row["L_C"] == "") == (measured == [])
+        for name in script.MEASURED if measured else ():
+            assert float(row[name]) == pytest.approx(np.mean([m[name] for m in measured]), rel=1e-5), name
+    assert progress[-1]["L_C"] != "" and (script is ppo or progress[0]["L_C"] == "")
+
+
+# ---- how a run ends --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loss", ["loss_C"])
+def test_nan_ends_a_run_and_the_last_checkpoint_is_kept(script, loss, tmp_path, monkeypatch):
+    """Some updates after the first checkpoint (step 40; off-policy learning begins at 63) it breaks down."""
+    real, calls = getattr(script, loss), []
+
+    def breaks_down(*args):
+        calls.append(0)
+        return real(*args) * (math.nan if len(calls) > 4 else 1)
+
+    monkeypatch.setattr(script, loss, breaks_down)
+    run = scripted_run(script, tmp_path, "a")
+    assert isinstance(run.error, logx.NotFinite)  # exit code 3
+    saved = checkpoint(run.folder)
+    assert saved["t"] == 40 and all(w.isfinite().all() for w in saved["learner"]["net"].values())
+
+
+def test_train_works_in_a_thread_and_raises_value_error_on_bad_input(script, world, tmp_path):
+    found = []
+
+    def work():
+        found.append(scripted_run(script, tmp_path, "thread", epochs=1))
+        found.append(scripted_run(script, tmp_path, "bad", epochs=0))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found[0].error is None and isinstance(found[1].error, ValueError)
+    assert curves(found[0].folder) == curves(world(script, "main", epochs=1).folder)
+
+
+def test_train_leaves_the_signal_handlers_as_they_were(script, world, tmp_path):
+    before = [signal.getsignal(number) for number in logx.STOP_SIGNALS]
+    world(script, "a", epochs=1)
+    scripted_run(script, tmp_path, "b", interrupt_at(5))
+    assert [signal.getsignal(number) for number in logx.STOP_SIGNALS] == before
+
+
+def test_quick_is_the_robust_recipe_and_ends_with_test_trials(script, tmp_path, monkeypatch):
+    ended = []
+    monkeypatch.setattr(script, "train", lambda flags: tmp_path / flags.recipe)
+    monkeypatch.setattr(evaluate, "after_training", lambda *args: ended.append(args))
+    monkeypatch.setattr("sys.argv", "script.py --task p2p --quick --quiet".split())
+    script.main()
+    assert ended == [(tmp_path / "robust", "p2p", "fast", True)]
+
+
+# ---- the policy ------------------------------------------------------------------------------------------------------
+
+WITHOUT_NOISE = {ddpg: dict(act_noise=0.0, update_every=40), ppo: dict(log_std=-20.0)}
+
+
+@pytest.mark.parametrize("symmetry", ["none", "canonical"])
+def test_policy_pt_is_the_policy_that_acts(script, symmetry, world):
+    """Both of these runs learn at step 80; what the second does from then on is what the first has saved."""
+    flags = WITHOUT_NOISE[script] | dict(symmetry=symmetry)
+    saved, run = world(script, "a", epochs=2, **flags), world(script, "b", **flags)
+    act, policy = evaluate.load_policy(saved.folder), torch.load(saved.folder / "policy.pt", weights_only=True)
+    for x in run.steps[80:]:
+        assert np.abs(act(x.s) - np.clip(x.a, -1, 1)).max() < 1e-5
+    assert set(policy) - {"grasp_input"} == {"task", "symmetry", "sizes", "output", "weights"}
+    if symmetry == "canonical":
+        assert np.abs(act(run.steps[80].s) - act(gas.rotate(run.steps[80].s, 1.0))).max() < 1e-5
+
+
+# ---- losses ----------------------------------------------------------------------------------------------------------
+
+
+def learner_and_buffers(script, **changes):
+    """A Learner with small networks, and arguments of its updates: random transitions, a fifth of them ends."""
+    flags = script.resolve(script.Flags(**TINY[script] | dict(lambda_bc=1.0, symmetry="none") | changes))
+    torch.manual_seed(0)
+    learner, rng, buffers = script.Learner(flags), np.random.default_rng(0), []
+    for n in (60, 40):
+        buffer = script.ReplayBuffer(22, n, "none") if script is ddpg else script.TrajectoryBuffer(22, n, "none")
+        for i in range(n):
+            s, a, s2 = (rng.normal(size=k).astype(np.float32) for k in (22, 4, 22))
+            end = i % 5 == 4
+            buffer.store(s, a, rng.normal(), s2, *((0.9 * (not end),) if script is ddpg else (end, end, True)))
+        buffers.append(buffer)
+    return learner, (*buffers, 3 if script is ddpg else torch.zeros(40))
+
+
+def weights(learner):
+    """(actor, critic): all weights of each."""
+    actor = learner.mu if hasattr(learner, "mu") else learner.omega
+    return [torch.cat([p.detach().flatten() for p in parameters]) for parameters in (actor, learner.nu)]
+
+
+def updated(script):
+    """(actor, critic) after three updates."""
+    learner, arguments = learner_and_buffers(script, **{} if script is ddpg else dict(train_iters=3))
+    learner.updates(*arguments)
+    return weights(learner)
+
+
+@pytest.mark.parametrize("loss", ["loss_C", "loss_O", "loss_BC", "loss_A", "mask"])
+def test_what_is_printed_is_what_trains(script, loss, monkeypatch):
+    """A loss replaced by zero gives other weights; without L_A the actor stays as it was, without L_C the critic."""
+    actor, critic = updated(script)
+    real = getattr(script, loss)
+    monkeypatch.setattr(script, loss, lambda *args: 0 * real(*args))
+    other_actor, other_critic = updated(script)
+    first_actor, first_critic = weights(learner_and_buffers(script)[0])
+    assert torch.equal(other_actor, first_actor) == (loss == "loss_A")
+    assert torch.equal(other_critic, first_critic) == (loss == "loss_C")
+    assert not torch.equal(other_critic, critic) if loss == "loss_C" else not torch.equal(other_actor, actor)
+
+
+def test_the_cloning_loss_averages_over_the_batch_and_the_four_actions(script):
+    """Eq. 7. Rows: 2, 0.25 and, masked out, 4; over 3 rows of 4 actions."""
+    a_demo = torch.tensor([[1.0, 0, 0, 0], [0, 0.5, 0, 0], [1, 1, 1, 1]])
+    a_hat = torch.tensor([[0.0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]])
+    assert script.loss_BC(a_demo, a_hat, torch.tensor([1.0, 1, 0])).item() == pytest.approx(2.25 / 12)
+    assert script.loss_BC(a_demo, a_hat, torch.zeros(3)).item() == 0
+
+
+def test_the_actor_loss_adds_lambda_times_the_cloning_loss(script):
+    assert script.loss_A(torch.tensor(2.0), torch.tensor(3.0), 1.5).item() == 6.5  # Eq. 6
+
+
+# ---- flags -----------------------------------------------------------------------------------------------------------
+
+
+def test_explicit_flags_win_over_the_recipe_and_the_recipe_over_nothing(script):
+    assert script.resolve(script.Flags()) == script.resolve(script.Flags(recipe="paper"))
+    assert script.resolve(script.Flags(quick=True)).recipe == "robust"
+    robust = vars(script.resolve(script.Flags(recipe="robust")))
+    task = robust["task"]
+    assert all(robust[name] == value for name, value in script.recipe_defaults(task, "robust").items())
+    given = script.recipe_defaults(task, "paper")
+    explicit = vars(script.resolve(script.Flags(recipe="robust", **given)))
+    assert {name: explicit[name] for name in given} == given != {name: robust[name] for name in given}
+
+
+@pytest.mark.parametrize("given, name", [
+    (dict(task="p2p"), "p2p-{}-paper-N100-lambda1.8-gas-seed0"),
+    (dict(task="p2po", recipe="robust", symmetry="so2", seed=7), "p2po-{}-robust-N250-lambda2-so2-seed7"),
+    (dict(task="pnp", num_demos=15, lambda_bc=0.5), "pnp-{}-paper-N15-lambda0.5-gas-seed0"),
+    (dict(task="p2p", gamma=0.9), "p2p-{}-paper-N100-lambda1.8-gas-gamma=0.9-seed0"),
+    (dict(task="p2p", epochs=7), "p2p-{}-paper-N100-lambda1.8-gas-epochs=7-seed0"),
+    (dict(task="p2p", data_dir="x", quiet=True, eval_every=0, resume=True), "p2p-{}-paper-N100-lambda1.8-gas-seed0"),
+    (dict(name="own", seed=7), "own"),
+])  # fmt: skip
+def test_the_default_name_says_task_algorithm_recipe_demonstrations_lambda_symmetry_and_seed(script, given, name):
+    algo = "ddpg" if script is ddpg else "ppo"
+    assert script.resolve(script.Flags(**given)).name == name.format(algo)
+
+
+def another(field, value):
+    """Another value of a flag."""
+    if field.metadata["choices"]:
+        return next(choice for choice in field.metadata["choices"] if choice != value)
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return (8, 8)
+    return "some/where/demos.npz" if value is None else value + 1 if isinstance(value, int) else 0.9 * value + 0.005
+
+
+def test_runs_that_differ_in_any_setting_differ_in_their_variant_and_name(script, tmp_path):
+    base = dict(demos_in_B_o=script is ddpg)  # off-policy cloning first needs it, on-policy noise does not go with it
+    plain = script.resolve(script.Flags(**base))
+    changed = {field.name: another(field, getattr(plain, field.name)) for field in fields(script.Flags)
+               if field.name not in logx.NOT_A_VARIANT | set(base)}  # fmt: skip
+    found = [script.resolve(script.Flags(**base | {name: value})) for name, value in changed.items()]
+    found.append(script.resolve(script.Flags(**base | changed)))  # every flag at once
+    for what in ("variant", "name"):
+        assert len({getattr(flags, what) for flags in (plain, *found)}) == len(found) + 1
+    for flags in found:
+        (tmp_path / flags.name).mkdir()  # no longer than a folder's name may be
+
+
+def test_what_a_tables_column_and_a_seed_say_makes_no_variant(script):
+    for given in (dict(), dict(seed=5, num_demos=7, lambda_bc=9.0, symmetry="so2"), dict(recipe="robust", epochs=3),
+                  dict(quick=True, eval_every=1, data_dir="x", name="y"), dict(gamma=0.99)):  # fmt: skip
+        assert script.resolve(script.Flags(**given)).variant == ""
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+BAD = {  # one a rule; what the message must name
+    "out of range": (dict(epochs=0), "--epochs 0: must be at least 1"),
+    "not finite": (dict(gamma=math.nan), "--gamma nan"),
+    "not a choice": (dict(task="p3p"), "--task p3p: must be one of p2p, p2po, pnp"),
+    "no folder's name": (dict(name="a/b"), "--name 'a/b'"),
+    "fewer demonstrations in the file": (dict(num_demos=9, demos="{file}", symmetry="none"), "--num_demos 9"),
+    "a file of another task": (dict(num_demos=1, demos="{file}", task="p2po"), "task p2p"),
+    "other sectors": (dict(num_demos=1, demos="{file}", symmetry="gas", partitions=8), "--partitions 8"),
+    "no such file": (dict(num_demos=1, demos="nowhere.npz"), "nowhere.npz"),
+}
+
+
+@pytest.fixture(scope="session")
+def demo_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demos") / "demos.npz"
+    meta = dict(task="p2p", stage="demo", env_steps=18, gains="fast", seed=3, partitions=4, symmetry="none")
+    np.savez_compressed(path, **demo_arrays(), meta=np.array(json.dumps(meta)))
+    return str(path)
+
+
+@pytest.mark.parametrize("rule", BAD)
+def test_bad_input_is_a_value_error_that_names_the_flag_and_leaves_no_folder(script, rule, tmp_path, demo_file):
+    flags, says = BAD[rule]
+    flags = {name: value.format(file=demo_file) if name == "demos" else value for name, value in flags.items()}
+    run = scripted_run(script, tmp_path / "runs", flags.pop("name", "a"), **flags)
+    assert isinstance(run.error, ValueError) and says in str(run.error)
+    assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").iterdir())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_cuda_without_a_gpu_is_bad_input(script, tmp_path):
+    run = scripted_run(script, tmp_path, "a", device="cuda")
+    assert isinstance(run.error, logx.BadInput) and "--device cuda" in str(run.error)
+
+
+@pytest.mark.parametrize("changes, says", [
+    (dict(resume=False), "go on with --resume, or choose another --name"),
+    (dict(gamma=0.5), "made with --gamma 0.99, not 0.5"),
+], ids=["not without --resume", "not with other flags"])  # fmt: skip
+def test_a_folder_of_a_run_is_gone_on_with_only_as_that_run(script, changes, says, world, tmp_path):
+    folder = world(script, "a", epochs=1).folder
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    run = scripted_run(script, tmp_path, "a", **dict(resume=True) | changes)
+    assert isinstance(run.error, logx.BadInput) and says in str(run.error)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_run_of_the_other_algorithm_is_not_gone_on_with(world, tmp_path):
+    world(ddpg, "a", epochs=1)
+    run = scripted_run(ppo, tmp_path, "a", resume=True)
+    assert isinstance(run.error, logx.BadInput) and "a run of ddpg, not of ppo" in str(run.error)
+
+
+# ---- the real world --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recipe", ["paper", "robust"])
+@pytest.mark.parametrize("task", OBS_DIM)
+def test_every_task_trains_with_every_recipe_and_its_agent_can_be_tested(script, task, recipe, tmp_path):
+    flags = TINY[script] | dict(task=task, recipe=recipe, num_demos=1, lambda_bc=None, epochs=1, eval_every=1,
+                                eval_trials=1, data_dir=str(tmp_path), max_ep_len=15, gains="fast")  # fmt: skip
+    flags |= dict(clone_iters=2) if recipe == "robust" else {}
+    flags |= dict(update_after=20) if script is ddpg else {}
+    folder = script.train(script.Flags(**flags))
+    (row,) = rows_of(folder / "progress.csv")
+    assert all(row[name] != "" for name in ("L_O", "L_BC", "L_C", "L_A", "mask_fraction", "EpRet", "eval_return"))
+    policy = torch.load(folder / "policy.pt", weights_only=True)
+    assert policy["task"] == task and policy["sizes"][0] == OBS_DIM[task] + bool(policy.get("grasp_input"))
+    rows, _ = evaluate.run_trials(task, folder, trials=1, horizon=5, quiet=True)
+    assert rows[0]["length"] <= 5
