@@ -76,7 +76,6 @@ class Flags:
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip targets to the range of possible returns")
     lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
-    retry: float | None = flag(None, "share of episodes that begin as one that failed; 0, robust: 0.5", low=0, high=1)
     # the run
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
     data_dir: str = flag("data/runs", "where run folders lie")
@@ -98,10 +97,10 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; the paper trains pnp with PPO: its sizes
 }
 PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
              normalize_obs=False, hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False,
-             clip_target=False, lr_decay=False, retry=0.0)  # fmt: skip
+             clip_target=False, lr_decay=False)  # fmt: skip
 ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
               normalize_obs=True, hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True,
-              clip_target=True, lr_decay=True, retry=0.5, start_steps=0)  # fmt: skip
+              clip_target=True, lr_decay=True, start_steps=0)  # fmt: skip
 ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs=40),
                "pnp": dict(epochs=50, hindsight=0)}  # another goal would not say where the cube is grasped
 
@@ -410,7 +409,7 @@ def loop(f, run):
     torch.manual_seed(f.seed)
     rng = np.random.default_rng(f.seed)  # of exploration and hindsight
     env = gymnasium.make(TASKS[f.task].env_id, stage="train", max_episode_steps=f.max_ep_len, disable_env_checker=True)
-    env = logx.Replayable(env, f.seed, f.retry)
+    env = logx.Replayable(env, f.seed)
     learner, B_d = Learner(f), None
     B_o = ReplayBuffer(OBS_DIM[f.task], f.replay_size, f.symmetry)
 

@@ -286,27 +286,17 @@ class Replayable(gymnasium.Wrapper):
     """An environment whose unfinished episode fits into a checkpoint: as the random state it began with and the actions
     since, which are played again (PyBullet's state is not enough to go on exactly).
 
-    retry: probability that an episode begins as one that failed did; it is kept until it succeeds, the last 100 such.
     `episode` holds the steps since reset, (s, a, r, s2, terminated, truncated) each. At its end info["episode"] holds
     the return "r" and the length "l", as with gymnasium's RecordEpisodeStatistics."""
 
-    def __init__(self, env, seed, retry=0.0):
+    def __init__(self, env, seed):
         super().__init__(env)
         env.reset(seed=seed)
-        self.retry, self.failed = retry, []  # random states
 
     def reset(self, *, seed=None, options=None):
-        random, after = self.unwrapped.np_random, None
-        if self.failed and random.random() < self.retry:
-            after, random.bit_generator.state = random.bit_generator.state, self.failed.pop(0)
-        return self._begin(after)
-
-    def _begin(self, after):
-        """after: the random state that new draws go on from, where they do not go on from this episode's."""
-        generator = self.unwrapped.np_random.bit_generator
-        self._began, self._after, self.episode = generator.state, after, []
-        self._s, info = self.env.reset()
-        generator.state = after or generator.state
+        self._began = self.unwrapped.np_random.bit_generator.state
+        self._s, info = self.env.reset(seed=seed, options=options)
+        self.episode = []
         return self._s, info
 
     def step(self, action):
@@ -316,21 +306,16 @@ class Replayable(gymnasium.Wrapper):
         self.episode.append((self._s, action, r, s2, terminated, truncated))
         self._s = s2
         if terminated or truncated:
-            if self.retry and not info["is_success"]:
-                self.failed = [*self.failed, self._began][-100:]
             info["episode"] = {"r": sum(step[2] for step in self.episode), "l": len(self.episode)}
         return s2, r, terminated, truncated, info
 
     def state(self):
-        draws = {"began": self._began, "after": self._after, "failed": self.failed}
-        return {"draws": json.dumps(draws), "actions": [step[1].tolist() for step in self.episode]}
+        return {"began": json.dumps(self._began), "actions": [step[1].tolist() for step in self.episode]}
 
     def load(self, state):
         """Plays the episode of `state` again. Returns the observation it had come to."""
-        draws = json.loads(state["draws"])
-        self.failed = draws["failed"]
-        self.unwrapped.np_random.bit_generator.state = draws["began"]
-        self._begin(draws["after"])
+        self.unwrapped.np_random.bit_generator.state = json.loads(state["began"])
+        self.reset()
         for a in state["actions"]:
             self.step(np.array(a, dtype=np.float32))
         return self._s
