@@ -370,6 +370,7 @@ class Learner:
             L_BC.backward()
             self.optimizer.step()
         self.target.load_state_dict(net.state_dict())
+        self.actor.load_state_dict(net.state_dict())
         for _ in range(f.clone_iters):
             self.update(B_o, B_d, hold_actor=True)
 
