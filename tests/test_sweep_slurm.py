@@ -6,7 +6,7 @@ import signal
 import subprocess
 
 import pytest
-from test_sweep import LONG, TINY, curves, run, runs_of, unbroken, wait_for  # noqa: F401 - a fixture
+from test_sweep import ENDLESS, SHORT, ends_as_an_unbroken_run, jobs_of, wait_for
 
 import sweep
 
@@ -86,55 +86,55 @@ def cluster(tmp_path_factory):
             os.environ["SLURM_CONF"] = before
 
 
-def submit(tmp_path, *flags, extra=TINY):
-    code, _, errors = run(*flags, "--cluster", "slurm", data_dir=tmp_path, extra=extra)
-    assert code == 0, errors
-    return runs_of(*flags, data_dir=tmp_path, extra=extra)
+def submit(data_dir, *flags):
+    """Submits a sweep and returns its jobs."""
+    flags = [*flags, "--cluster", "slurm", "--data_dir", str(data_dir)]
+    assert not sweep.main(flags)
+    return jobs_of(*flags)
 
 
-def all_done(runs):
-    return all(run.state()[0] == "done" for run in runs)
+def states(jobs):
+    return [job.state()[0] for job in jobs]
 
 
-def logs(tmp_path):
-    return "".join(path.read_text() for path in sorted((tmp_path / "slurm").glob("*.err")))
-
-
-def test_sweep_of_four_runs_goes_to_its_end_on_a_node_drained_meanwhile_and_is_not_submitted_twice(cluster, tmp_path):
-    short = ["--task", "p2p", "--columns", "baseline", "demos=0", "--epochs", 4, "--steps_per_epoch", 100, "--seeds", 2]
+def test_sweep_of_four_runs_goes_to_its_end_on_a_node_drained_meanwhile_and_is_not_submitted_twice(
+    cluster, tmp_path, capsys
+):
+    flags = [*SHORT, "--columns", "baseline", "demos=0", "--seeds", "2"]
     slurm("scontrol", "update", "nodename=localhost", "state=drain", "reason=repair")
-    runs = submit(tmp_path, *short)
-    assert [run.state()[0] for run in runs] == ["queued"] * 4
-    code, out, _ = run(*short, "--cluster", "slurm", data_dir=tmp_path)
-    assert code == 0 and "4 runs, 0 to do" in out
+    jobs = submit(tmp_path, *flags)
+    assert states(jobs) == ["queued"] * 4
+    submit(tmp_path, *flags)
+    assert capsys.readouterr().out.endswith("4 runs, 0 to do\n")
     slurm("scontrol", "update", "nodename=localhost", "state=resume")
-    wait_for(lambda: any(run.state()[0] == "running" for run in runs))
+    wait_for(lambda: "running" in states(jobs))
     slurm("scontrol", "update", "nodename=localhost", "state=drain", "reason=repair")  # what runs goes on
-    wait_for(lambda: sum(run.state()[0] == "done" for run in runs) >= 1)
+    wait_for(lambda: "done" in states(jobs))
     slurm("scontrol", "update", "nodename=localhost", "state=resume")
-    wait_for(lambda: all_done(runs))
+    wait_for(lambda: states(jobs) == ["done"] * 4)
 
 
-def test_job_that_is_requeued_in_mid_run_ends_where_an_unbroken_run_ends(cluster, tmp_path, unbroken):  # noqa: F811
-    (only,) = submit(tmp_path, *LONG, "--seeds", 1)
-    wait_for(lambda: only.steps() >= 200)
-    job = (only.folder / "slurm_job").read_text()
-    slurm("scontrol", "requeue", job)
-    wait_for(lambda: only.state()[0] == "queued")
-    assert 200 <= only.steps() < only.total
-    wait_for(lambda: all_done([only]))
-    assert "Restarts=1" in slurm("scontrol", "show", "job", job)
-    assert curves(only.folder) == unbroken[0]
+def test_job_that_is_requeued_in_mid_run_ends_where_an_unbroken_run_ends(cluster, tmp_path):
+    (job,) = submit(tmp_path / "runs", *ENDLESS, "--seeds", "1")
+    wait_for(lambda: job.steps() >= 200)
+    number = job.text("slurm_job")
+    slurm("scontrol", "requeue", number)
+    wait_for(lambda: states([job]) == ["queued"])
+    before = job.steps()
+    wait_for(lambda: job.steps() > before)
+    assert "Restarts=1" in slurm("scontrol", "show", "job", number)
+    slurm("scancel", number)
+    wait_for(lambda: states([job]) == ["stopped"])
+    assert ends_as_an_unbroken_run(job, tmp_path / "unbroken")
 
 
 def test_job_whose_time_is_up_saves_its_state_is_queued_again_and_goes_on(cluster, tmp_path):
-    endless = ["--task", "p2p", "--columns", "baseline", "--epochs", 100_000_000, "--steps_per_epoch", 1000]
-    flags = [*endless, "--seeds", 1, "--time", 2, "--signal_delay", 30]
-    (only,) = submit(tmp_path, *flags)
-    wait_for(lambda: "this job is timed-out" in logs(tmp_path), 180)
-    wait_for(lambda: only.state()[0] == "queued")
-    before = only.steps()
-    assert before > 0 and sweep.log_lines(only.folder)[-1].endswith("state saved; go on with --resume")
-    wait_for(lambda: only.steps() > before)
-    slurm("scancel", (only.folder / "slurm_job").read_text())
-    wait_for(lambda: only.state()[0] != "running")
+    (job,) = submit(tmp_path, *ENDLESS, "--seeds", "1", "--time", "2", "--signal_delay", "30")
+    logs = tmp_path / "slurm"
+    wait_for(lambda: any("this job is timed-out" in path.read_text() for path in logs.glob("*.err")), 180)
+    wait_for(lambda: states([job]) == ["queued"])
+    before = job.steps()
+    assert before > 0 and job.text("log.txt").splitlines()[-1].endswith("state saved; go on with --resume")
+    wait_for(lambda: job.steps() > before)
+    slurm("scancel", job.text("slurm_job"))
+    wait_for(lambda: states([job]) == ["stopped"])
