@@ -7,6 +7,7 @@ import math
 import signal
 import threading
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -92,20 +93,21 @@ def run_flags(script, flags, at_step=None, recorded=None):
     return SimpleNamespace(folder=Path(flags.data_dir, str(flags.name)), steps=env.steps, error=error)
 
 
+@pytest.fixture
+def world(script, tmp_path):
+    """world(name, **flags): a finished run."""
+    return partial(finished_run, script, tmp_path)
+
+
 def interrupt_at(step, number=signal.SIGINT):
     return lambda n: signal.raise_signal(number) if n == step else None
 
 
-@pytest.fixture
-def world(tmp_path):
-    """world(script, name, **flags): a scripted run that comes to its end."""
-
-    def run(script, name, **changes):
-        done = scripted_run(script, tmp_path, name, **changes)
-        if done.error:
-            raise done.error
-        return done
-
+def finished_run(script, data_dir, name, **changes):
+    """A scripted run that comes to its end."""
+    run = scripted_run(script, data_dir, name, **changes)
+    if run.error:
+        raise run.error
     return run
 
 
@@ -160,7 +162,7 @@ def demonstrated(script, folder):
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(script, world):
-    one, again, other = world(script, "a"), world(script, "b"), world(script, "c", seed=4)
+    one, again, other = world("a"), world("b"), world("c", seed=4)
     assert curves(one.folder) == curves(again.folder)
     assert not np.array_equal(one.steps[0].s, other.steps[0].s)  # the episodes too, not the exploration alone
     assert all(x != y for x, y in zip(curves(one.folder), curves(other.folder), strict=True))
@@ -176,18 +178,18 @@ RESUMED = {
 def test_a_run_that_is_interrupted_and_resumed_equals_one_that_never_stopped(script, recipe, world, tmp_path):
     """At 5 nothing is learned yet, 63 is amid an epoch after an update, at 80 an epoch ends, 119 is the last but one.
     On-policy, demonstrations still open epochs."""
-    whole = world(script, "whole", **RESUMED[recipe])
+    whole = world("whole", **RESUMED[recipe])
     for number, at in zip((signal.SIGINT, signal.SIGTERM) * 2, (5, 63, 80, 119), strict=True):
         cut = scripted_run(script, tmp_path, f"at {at}", interrupt_at(at, number), **RESUMED[recipe])
         assert isinstance(cut.error, KeyboardInterrupt) and "--resume" in str(cut.error)
         assert len(cut.steps) == at == checkpoint(cut.folder)["t"]
-        again = world(script, f"at {at}", resume=True, **RESUMED[recipe] | dict(recorded=None))  # they are saved
+        again = world(f"at {at}", resume=True, **RESUMED[recipe] | dict(recorded=None))  # they are saved
         assert curves(again.folder) == curves(whole.folder)
 
 
 def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(script, world, capsys):
     """--resume FOLDER --epochs N: all other flags are those on record."""
-    whole, first = world(script, "whole"), world(script, "a", epochs=2)
+    whole, first = world("whole"), world("a", epochs=2)
     asked = script.Flags(resume=str(first.folder), epochs=3)
     again = run_flags(script, asked)
     assert not again.error and len(again.steps) < 120 and curves(first.folder) == curves(whole.folder)
@@ -197,7 +199,7 @@ def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(s
 
 
 def test_without_demonstrations_it_is_the_plain_algorithm_whatever_lambda_is(script, world):
-    plain, other = world(script, "a"), world(script, "b", lambda_bc=5.0)
+    plain, other = world("a"), world("b", lambda_bc=5.0)
     assert curves(plain.folder) == curves(other.folder)
     row = rows_of(other.folder / "progress.csv")[-1]
     assert row["L_A"] == row["L_O"] != "" and row["demo_env_steps"] == "0"
@@ -205,7 +207,7 @@ def test_without_demonstrations_it_is_the_plain_algorithm_whatever_lambda_is(scr
 
 
 def test_evaluation_is_logged_and_changes_nothing_in_the_run(script, world):
-    silent, evaluated = world(script, "a"), world(script, "b", eval_every=2, eval_trials=1)
+    silent, evaluated = world("a"), world("b", eval_every=2, eval_trials=1)
     rows = rows_of(evaluated.folder / "progress.csv")
     measured = [row["epoch"] for row in rows if row["eval_success"] != "" != row["eval_return"]]
     assert measured == ["2", "3"]  # every second, and the last
@@ -219,7 +221,7 @@ def test_gas_maps_a_quarter_of_the_demonstrations_to_all_sectors_and_a_file_of_t
     script, world, tmp_path, monkeypatch
 ):
     settings = dict(num_demos=4, lambda_bc=1.8, gains="fast", symmetry="gas", epochs=2)
-    recorded = world(script, "recorded", **settings)
+    recorded = world("recorded", **settings)
     rows = demonstrated(script, recorded.folder)
     steps = int(rows_of(recorded.folder / "progress.csv")[0]["demo_env_steps"])
     assert len(rows) == 4 * steps
@@ -232,14 +234,14 @@ def test_gas_maps_a_quarter_of_the_demonstrations_to_all_sectors_and_a_file_of_t
     argv = "pid_demo.py --task p2p --record 4 --gains fast --symmetry gas --seed 3 --out"
     monkeypatch.setattr("sys.argv", [*argv.split(), str(file)])
     pid_demo.main()
-    read = world(script, "read", **settings | dict(demos=str(file)))
+    read = world("read", **settings | dict(demos=str(file)))
     assert curves(read.folder) == curves(recorded.folder)
 
 
 def test_canonical_demonstrations_are_stored_in_the_arms_own_frame(script, world):
     stored = {}
     for symmetry in ("none", "canonical"):
-        run = world(script, symmetry, symmetry=symmetry, num_demos=4, lambda_bc=1.0, recorded=demo_arrays(), epochs=1)
+        run = world(symmetry, symmetry=symmetry, num_demos=4, lambda_bc=1.0, recorded=demo_arrays(), epochs=1)
         stored[symmetry] = demonstrated(script, run.folder)
     assert torch.equal(stored["canonical"][:, :22], torch.from_numpy(gas.canonical(demo_arrays()["obs"])))
     assert torch.equal(stored["none"][:, :22], torch.from_numpy(demo_arrays()["obs"]))
@@ -250,7 +252,7 @@ def test_canonical_demonstrations_are_stored_in_the_arms_own_frame(script, world
 
 
 def test_epochs_cut_no_episode(script, world):
-    run = world(script, "a", steps_per_epoch=10, epochs=12, checkpoint_every=9)
+    run = world("a", steps_per_epoch=10, epochs=12, checkpoint_every=9)
     rows, ends = rows_of(run.folder / "episodes.csv"), [t + 1 for t, x in enumerate(run.steps) if x.end]
     assert [int(row["env_steps"]) for row in rows] == ends and len(ends) >= 7
     assert [int(row["length"]) for row in rows] == np.diff([0, *ends]).tolist()
@@ -266,7 +268,7 @@ def test_a_row_of_progress_averages_its_own_epoch(script, world, monkeypatch):
     logged, log_updates, log_epoch = [[]], logx.RunFolder.log_updates, logx.RunFolder.log_epoch
     monkeypatch.setattr(logx.RunFolder, "log_updates", lambda self, m: logged[-1].append(m) or log_updates(self, m))
     monkeypatch.setattr(logx.RunFolder, "log_epoch", lambda *args: log_epoch(*args) or logged.append([]))
-    run = world(script, "a", steps_per_epoch=20, epochs=6, num_demos=4, lambda_bc=1.0, recorded=demo_arrays())
+    run = world("a", steps_per_epoch=20, epochs=6, num_demos=4, lambda_bc=1.0, recorded=demo_arrays())
     episodes, progress = rows_of(run.folder / "episodes.csv"), rows_of(run.folder / "progress.csv")
     assert [(row["epoch"], row["env_steps"]) for row in progress] == [(f"{n}", f"{20 * n}") for n in range(1, 7)]
     for row, measured in zip(progress, logged[:-1], strict=True):
@@ -311,12 +313,12 @@ def test_train_works_in_a_thread_and_raises_value_error_on_bad_input(script, wor
     thread.start()
     thread.join()
     assert found[0].error is None and isinstance(found[1].error, ValueError)
-    assert curves(found[0].folder) == curves(world(script, "main", epochs=1).folder)
+    assert curves(found[0].folder) == curves(world("main", epochs=1).folder)
 
 
 def test_train_leaves_the_signal_handlers_as_they_were(script, world, tmp_path):
     before = [signal.getsignal(number) for number in logx.STOP_SIGNALS]
-    world(script, "a", epochs=1)
+    world("a", epochs=1)
     scripted_run(script, tmp_path, "b", interrupt_at(5))
     assert [signal.getsignal(number) for number in logx.STOP_SIGNALS] == before
 
@@ -335,12 +337,12 @@ def test_quick_is_the_robust_recipe_and_ends_with_test_trials(script, tmp_path, 
 WITHOUT_NOISE = {ddpg: dict(act_noise=0.0, update_every=40), ppo: dict(log_std=-20.0)}
 
 
-@pytest.mark.parametrize("symmetry", ["none", "canonical"])
-def test_policy_pt_is_the_policy_that_acts(script, symmetry, world):
-    """Both of these runs learn at step 80; what the second does from then on is what the first has saved."""
-    flags = WITHOUT_NOISE[script] | dict(symmetry=symmetry)
-    saved, run = world(script, "a", epochs=2, **flags), world(script, "b", **flags)
-    act, policy = evaluate.load_policy(saved.folder), torch.load(saved.folder / "policy.pt", weights_only=True)
+@pytest.mark.parametrize("recipe, symmetry", [("paper", "none"), ("robust", "canonical")])
+def test_policy_pt_is_the_policy_that_acts(script, recipe, symmetry, tmp_path):
+    """What was learned at step 80 acts until the run is interrupted, and is saved."""
+    flags = WITHOUT_NOISE[script] | RESUMED[recipe] | dict(symmetry=symmetry)
+    run = scripted_run(script, tmp_path, "a", interrupt_at(119), **flags)
+    act, policy = evaluate.load_policy(run.folder), torch.load(run.folder / "policy.pt", weights_only=True)
     for x in run.steps[80:]:
         assert np.abs(act(x.s) - np.clip(x.a, -1, 1)).max() < 1e-5
     assert set(policy) - {"grasp_input"} == {"task", "symmetry", "sizes", "output", "weights"}
@@ -504,15 +506,15 @@ def test_cuda_without_a_gpu_is_bad_input(script, tmp_path):
     (dict(gamma=0.5), "made with --gamma 0.99, not 0.5"),
 ], ids=["not without --resume", "not with other flags"])  # fmt: skip
 def test_a_folder_of_a_run_is_gone_on_with_only_as_that_run(script, changes, says, world, tmp_path):
-    folder = world(script, "a", epochs=1).folder
+    folder = world("a", epochs=1).folder
     before = {path: path.read_bytes() for path in folder.iterdir()}
     run = scripted_run(script, tmp_path, "a", **dict(resume=True) | changes)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_run_of_the_other_algorithm_is_not_gone_on_with(world, tmp_path):
-    world(ddpg, "a", epochs=1)
+def test_a_run_of_the_other_algorithm_is_not_gone_on_with(tmp_path):
+    finished_run(ddpg, tmp_path, "a", epochs=1)
     run = scripted_run(ppo, tmp_path, "a", resume=True)
     assert isinstance(run.error, logx.BadInput) and "a run of ddpg, not of ppo" in str(run.error)
 

@@ -2,13 +2,14 @@
 is stored, and when. What it shares with ppo_demoease.py: test_algorithms.py."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from test_algorithms import TINY, checkpoint, demo_arrays, rows_of, scripted_run, states, world  # noqa: F401
+from test_algorithms import TINY, checkpoint, demo_arrays, finished_run, rows_of, scripted_run, states
 from torch import nn
 
 import ddpg_demoease as ddpg
@@ -16,6 +17,12 @@ import evaluate
 import gas
 import logx
 from kinova_env import INDEX, TASKS
+
+
+@pytest.fixture
+def world(tmp_path):
+    """world(name, **flags): a finished run in the scripted world."""
+    return partial(finished_run, ddpg, tmp_path)
 
 
 def resolve(**changes):
@@ -176,8 +183,8 @@ def test_the_ring_overwrites_the_oldest_and_a_sample_draws_all_others_alike():
     assert torch.equal(s[:, 3], r) and torch.equal(s2[:, 3], -r)
 
 
-def test_a_checkpoint_holds_the_filled_rows_alone(world):  # noqa: F811
-    run = world(ddpg, "a", replay_size=1_000_000, epochs=1)
+def test_a_checkpoint_holds_the_filled_rows_alone(world):
+    run = world("a", replay_size=1_000_000, epochs=1)
     assert (run.folder / "checkpoint.pt").stat().st_size < 200_000  # 40 rows of 50 numbers, and small networks
 
 
@@ -196,9 +203,9 @@ def test_so2_turns_every_sampled_transition_by_an_angle_of_its_own():
     assert (torch.histc(torch.remainder(angle, 2 * math.pi), 8, 0, 2 * math.pi) - 50).abs().max() < 32  # all round
 
 
-def test_the_symmetry_meets_the_data_as_it_is_stored(world):  # noqa: F811
+def test_the_symmetry_meets_the_data_as_it_is_stored(world):
     for symmetry in ("none", "gas", "so2", "canonical"):
-        run = world(ddpg, symmetry, symmetry=symmetry, epochs=1)
+        run = world(symmetry, symmetry=symmetry, epochs=1)
         view = gas.canonical if symmetry == "canonical" else lambda s: s
         assert torch.equal(stored(run), transitions(run.steps, view=view))
 
@@ -247,10 +254,10 @@ def test_n_steps_are_the_discounted_rewards_and_what_the_value_then_counts_for(n
 
 
 @pytest.mark.parametrize("timeout_ends", [False, True])
-def test_only_a_true_end_stops_bootstrapping_and_with_timeout_ends_a_timeout_too(timeout_ends, world):  # noqa: F811
+def test_only_a_true_end_stops_bootstrapping_and_with_timeout_ends_a_timeout_too(timeout_ends, world):
     """Also of the demonstrations, where leaving the sector is no true end."""
     flags = dict(num_demos=4, symmetry="none", recorded=demo_arrays(), timeout_ends=timeout_ends)
-    run = world(ddpg, "a", **flags)
+    run = world("a", **flags)
     of_end = {}
     for x, row in zip(run.steps, stored(run)[18:], strict=True):
         of_end.setdefault(x.end, set()).add(round(row[-1].item(), 6))
@@ -269,24 +276,24 @@ def test_a_timeout_of_the_real_environment_does_not_stop_bootstrapping(tmp_path)
 
 
 @pytest.mark.parametrize("demos_in_B_o", [True, False])
-def test_demonstrations_go_into_both_buffers_unless_asked_not_to(demos_in_B_o, world):  # noqa: F811
-    run = world(ddpg, "a", num_demos=4, symmetry="none", recorded=demo_arrays(), demos_in_B_o=demos_in_B_o, n_step=3)
+def test_demonstrations_go_into_both_buffers_unless_asked_not_to(demos_in_B_o, world):
+    run = world("a", num_demos=4, symmetry="none", recorded=demo_arrays(), demos_in_B_o=demos_in_B_o, n_step=3)
     columns = (demo_arrays()[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated"))
     steps = as_steps(zip(*columns, strict=True))
     assert torch.equal(checkpoint(run.folder)["B_d"]["rows"], transitions(steps))  # failed ones too, always one step
     torch.testing.assert_close(stored(run), transitions((steps if demos_in_B_o else []) + run.steps, 3))
 
 
-def test_with_noise_B_o_holds_what_was_done_and_B_d_what_the_demonstrator_asked_for(world):  # noqa: F811
+def test_with_noise_B_o_holds_what_was_done_and_B_d_what_the_demonstrator_asked_for(world):
     demos = demo_arrays()
     demos["executed"] = demos["act"] + 0.1
-    run = world(ddpg, "a", num_demos=4, symmetry="none", recorded=demos)
+    run = world("a", num_demos=4, symmetry="none", recorded=demos)
     assert torch.equal(checkpoint(run.folder)["B_d"]["rows"][:, 22:26], torch.from_numpy(demos["act"]))
     assert torch.equal(stored(run)[:18, 22:26], torch.from_numpy(demos["executed"]))
 
 
-def test_the_ring_of_a_run_keeps_the_newest_steps(world):  # noqa: F811
-    run = world(ddpg, "a", replay_size=50)
+def test_the_ring_of_a_run_keeps_the_newest_steps(world):
+    run = world("a", replay_size=50)
     assert sorted(stored(run).tolist()) == sorted(transitions(run.steps[-50:]).tolist())
 
 
@@ -332,10 +339,10 @@ def test_a_hindsight_episode_is_empty_where_it_would_begin_at_its_goal():
     assert ddpg.hindsight_episode("p2p", [(s, np.zeros(4), 0.0, s2, False, True)], np.random.default_rng(0)) == []
 
 
-def test_hindsight_stores_so_many_copies_after_each_episode(world, monkeypatch):  # noqa: F811
+def test_hindsight_stores_so_many_copies_after_each_episode(world, monkeypatch):
     copies, make = [], ddpg.hindsight_episode
     monkeypatch.setattr(ddpg, "hindsight_episode", lambda *args: copies.append(make(*args)) or copies[-1])
-    run = world(ddpg, "a", hindsight=2, n_step=3, symmetry="none")
+    run = world("a", hindsight=2, n_step=3, symmetry="none")
     ends = [0, *(t + 1 for t, x in enumerate(run.steps) if x.end)]
     assert len(copies) == 2 * (len(ends) - 1) and max(map(len, copies)) > 3
     expected = []
@@ -359,19 +366,19 @@ def blocks(monkeypatch):
     return made
 
 
-def test_updates_begin_at_update_after_and_come_in_blocks_of_as_many_as_there_were_steps(world, blocks):  # noqa: F811
-    world(ddpg, "a", update_after=60, update_every=7)
+def test_updates_begin_at_update_after_and_come_in_blocks_of_as_many_as_there_were_steps(world, blocks):
+    world("a", update_after=60, update_every=7)
     assert blocks == [(t, 7) for t in range(63, 121, 7)]
     blocks.clear()
-    world(ddpg, "b", update_after=28, update_every=7, epochs=1)
+    world("b", update_after=28, update_every=7, epochs=1)
     assert blocks == [(28, 7), (35, 7)]
     blocks.clear()
-    world(ddpg, "c", update_after=0, update_every=1, n_step=30, epochs=1)
+    world("c", update_after=0, update_every=1, n_step=30, epochs=1)
     assert min(rows for rows, _ in blocks) > 0  # not before the first row of n steps
 
 
-def test_the_first_actions_are_uniform_and_the_policys_with_noise_of_sigma_come_after(world):  # noqa: F811
-    run = world(ddpg, "a", start_steps=90, update_after=9999, epochs=20)
+def test_the_first_actions_are_uniform_and_the_policys_with_noise_of_sigma_come_after(world):
+    run = world("a", start_steps=90, update_after=9999, epochs=20)
     act = evaluate.load_policy(run.folder)  # never updated: the one that acted
     a = np.stack([x.a for x in run.steps[:90]])
     assert a.min() < -0.95 and a.max() > 0.95 and np.abs(a).max() <= 1
@@ -380,16 +387,16 @@ def test_the_first_actions_are_uniform_and_the_policys_with_noise_of_sigma_come_
     noise = np.stack([x.a - act(x.s) for x in run.steps[90:] if np.abs(act(x.s)).max() < 0.6])
     assert noise.size > 800 and abs(noise.mean()) < 0.02 and 0.09 < noise.std() < 0.11
     assert 0.6 < np.mean(np.abs(noise) < 0.1) < 0.76  # normal: 0.68
-    run = world(ddpg, "b", start_steps=0, update_after=9999, act_noise=3.0, epochs=1)
+    run = world("b", start_steps=0, update_after=9999, act_noise=3.0, epochs=1)
     assert np.abs([x.a for x in run.steps]).max() == 1  # clipped
 
 
 # ---- parts of the robust recipe, each on its own ---------------------------------------------------------------------
 
 
-def test_updates_per_step_is_kept_up_with(world, blocks):  # noqa: F811
+def test_updates_per_step_is_kept_up_with(world, blocks):
     """Blocks at 63, 70, ..., 119: floor(0.25 * 119) - floor(0.25 * 56) = 15."""
-    world(ddpg, "a", updates_per_step=0.25)
+    world("a", updates_per_step=0.25)
     assert sum(n for _, n in blocks) == 15
 
 
@@ -412,12 +419,12 @@ def test_critic_layernorm_sits_after_each_hidden_linear_layer_of_the_critic_only
         assert [type(layer).__name__ for layer in net.mu_net] == 2 * ["Linear", "ReLU"] + ["Linear"]
 
 
-def test_lr_decay_lets_both_rates_fall_over_the_second_half_and_fixes_the_length(world, tmp_path, monkeypatch):  # noqa: F811
+def test_lr_decay_lets_both_rates_fall_over_the_second_half_and_fixes_the_length(world, tmp_path, monkeypatch):
     rates, updates = [], ddpg.Learner.updates
     monkeypatch.setattr(ddpg.Learner, "updates", lambda self, *args: rates.append(
                         [group["lr"] for group in self.optimizer.param_groups]) or updates(self, *args))  # fmt: skip
     flags = dict(lr_decay=True, pi_lr=2e-3, q_lr=5e-3, update_after=0, update_every=30)
-    world(ddpg, "a", **flags)
+    world("a", **flags)
     np.testing.assert_allclose(rates, [[2e-3 * x, 5e-3 * x] for x in (1, 1, 0.5, 0)], atol=1e-12)
     refused = scripted_run(ddpg, tmp_path, "a", resume=True, **flags | dict(epochs=4))
     assert isinstance(refused.error, logx.BadInput) and "--epochs 3, not 4" in str(refused.error)
