@@ -176,20 +176,22 @@ NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed",
 
 def recorded(flags):
     """With --resume FOLDER, the flags that the run there was begun with, and what else was asked for now; else the
-    flags as they are. Raises BadInput where the folder holds no run of this script."""
+    flags as they are. Raises BadInput where the folder holds no run of this script, or no checkpoint to go on from."""
     if not isinstance(flags.resume, str):
         return flags
-    file = Path(flags.resume) / "config.json"
+    folder = Path(flags.resume)
+    folder = folder.resolve() if folder.name in ("", "..") else folder
     try:
-        config = json.loads(file.read_text())
+        config = json.loads((folder / "config.json").read_text())
         fields = {field.name: field.default for field in dataclasses.fields(flags)}
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
         if missing := set(fields) - set(before):
-            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+            raise ValueError(f"its config.json lacks {', '.join(sorted(missing))}")
+        os.stat(folder / "checkpoint.pt")
     except (OSError, ValueError, AttributeError) as error:
-        raise BadInput(f"--resume {flags.resume}: must be a run's folder; {file} is none ({one_line(error)})") from None
+        raise BadInput(f"--resume {folder}: must be a run's folder with a checkpoint ({one_line(error)})") from None
     asked = {name: v for name, v in dataclasses.asdict(flags).items() if v != fields[name]}
-    where = {"name": file.parent.resolve().name, "data_dir": str(file.parent.parent), "resume": True}
+    where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}
     return dataclasses.replace(flags, **(before | asked | where))
 
 
@@ -482,7 +484,8 @@ class RunFolder:
             text = (text if self._config["epochs"] > before["epochs"] else before) | {"versions": before["versions"]}
             resumed = before.get("resumed_with", [])
             if made_with != [before["versions"], *resumed][-1]:
-                text["resumed_with"] = [*resumed, made_with]
+                resumed = [*resumed, made_with]
+            text |= {"resumed_with": resumed} if resumed else {}
         atomic_write(self.folder / "config.json", json.dumps(text, indent=1, default=str))
 
     @contextlib.contextmanager

@@ -1,145 +1,203 @@
-"""logx.py: flags from a dataclass, files that are always whole, a run's folder, and safe loading."""
+"""logx.py: flags from a dataclass, exit codes, files that are always whole, a run's folder, and safe loading."""
 
 import io
 import json
 import math
 import os
 import pickle
-import random
-import re
+import signal
 import subprocess
-import time
-from dataclasses import dataclass
+import sys
+import threading
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
 import logx
-from logx import flag
-
-CONFIG = {"task": "p2p", "gamma": 0.99, "seed": 0, "hidden_sizes": (16, 16), "epochs": 5, "name": "a"}
+from ddpg_demoease import Flags
+from logx import BadInput, flag
 
 
 @dataclass
-class Flags:
+class Kinds:
     """One field of every kind."""
 
     task: str = flag("a", choices=("a", "b"))
     recipe: str | None = flag(None, "help of recipe", ("x", "y"))
     epochs: int = flag(3, low=1, high=5)
-    count: int | None = flag(None, low=0)
+    batch_size: int | None = flag(None, low=0)
     rate: float = flag(0.5)
-    gain: float | None = flag(None, low=0)
     sizes: tuple[int, ...] | None = flag(None, "help of sizes", low=1)
+    start: tuple[float, float, float] | None = flag(None)
+    words: tuple[str, ...] = flag(("one", "two"), "100 % of them", choices=("one", "two"))
+    out: Path = flag(Path("here"))
     fast: bool = flag(False)
     maybe: bool | None = flag(None)
+    resume: bool | str = flag(False, metavar="FOLDER")
+    set_by_hand: str = ""
+
+
+MEASURED = ["L_C", "L_A"]
 
 
 def parse(*argv):
-    return logx.parse_flags(Flags, "What it does.", list(argv))
+    return logx.parse_flags(Kinds, "What it does.", list(argv))
 
 
-def error_line(capsys, call, *args, **kwargs):
-    """What a call says on bad input: exit code 2, nothing on standard output, one line on standard error."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stopped:
-        call(*args, **kwargs)
-    out, err = capsys.readouterr()
-    assert stopped.value.code == 2 and not out and err.count("\n") == 1, (stopped.value.code, out, err)
-    return err
+def folder_of(path, fixed_length=False, algo="ddpg", **changes):
+    """A run's folder as a script takes it: path is DATA_DIR/NAME."""
+    flags = Flags(epochs=4, steps_per_epoch=50, hidden_sizes=(16, 16), name=path.name, quiet=True)
+    flags = replace(flags, data_dir=str(path.parent), **changes)
+    return logx.RunFolder(flags, algo, MEASURED, fixed_length)
 
 
-def begin(folder, config, resume=False, tensorboard=False):
-    """A run as the training scripts begin it."""
-    logx.is_new(folder, resume)
-    return logx.Run(folder, config, tensorboard)
+def log_episode(run, t, success=False):
+    episode = {"r": -t / 3, "l": t}
+    run.log_episode(t, {"episode": episode, "is_success": success, "collision": "" if success else "self"})
 
 
-def close(run):
-    """Lets go of a run's folder as the end of its process does."""
-    for file in (run._lock, *run._files.values()):
-        file.close()
+@pytest.fixture
+def stopped(tmp_path):
+    """A run that was stopped after a checkpoint at step 50, with rows that the checkpoint does not know."""
+    with folder_of(tmp_path / "a") as run:
+        run.begin(demo_env_steps=7)
+        for t in (20, 50):
+            log_episode(run, t)
+        run.log_epoch(50, {})
+        run.save({"t": 50, "tensor": torch.arange(3)}, {"weights": {}})
+        log_episode(run, 90)
+        run.log_epoch(100, {})
+    return tmp_path / "a"
 
 
-def text(path):
-    return path.read_bytes().decode()
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def first_column(path):
+    return [line.split(",")[0] for line in path.read_text().splitlines()]
 
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
 
 
-def test_an_empty_command_line_gives_every_default():
-    assert parse() == Flags()
-
-
 @pytest.mark.parametrize("argv, field, value", [
     (["--task", "b"], "task", "b"),
     (["--recipe", "y"], "recipe", "y"),
-    (["--epochs", "4"], "epochs", 4),
-    (["--count", "7"], "count", 7),
+    (["--epochs", "5"], "epochs", 5),
     (["--rate", "1e-3"], "rate", 1e-3),
-    (["--gain", "2"], "gain", 2.0),
+    (["--sizes", "128", "512", "128"], "sizes", (128, 512, 128)),
+    (["--start", "-1.5", "0", "1"], "start", (-1.5, 0.0, 1.0)),
+    (["--words", "two"], "words", ("two",)),
+    (["--out", "a/b"], "out", Path("a/b")),
     (["--fast"], "fast", True),
-    (["--fast", "--no-fast"], "fast", False),
     (["--maybe"], "maybe", True),
     (["--no-maybe"], "maybe", False),
+    (["--resume"], "resume", True),
+    (["--resume", "a/b"], "resume", "a/b"),
 ])  # fmt: skip
-def test_a_field_is_a_flag_of_its_annotated_type(argv, field, value):
-    flags = parse(*argv)
-    assert getattr(flags, field) == value and type(getattr(flags, field)) is type(value)
-    setattr(flags, field, getattr(Flags(), field))
-    assert flags == Flags()  # and no other field changed
+def test_a_field_is_a_flag_of_its_annotated_type_and_the_others_keep_their_defaults(argv, field, value):
+    assert parse() == Kinds()
+    assert parse(*argv) == Kinds(**{field: value}) and type(getattr(parse(*argv), field)) is type(value)
 
 
-def test_a_tuple_takes_its_numbers_separated_by_spaces():
-    assert list(parse("--sizes", "128", "512", "128").sizes) == [128, 512, 128]
-
-
-@pytest.mark.parametrize("argv, named", [
+@pytest.mark.parametrize("argv, says", [
     (["--task", "c"], "--task"),
-    (["--recipe", "z"], "--recipe"),
+    (["--words", "three"], "--words"),
     (["--epochs", "2.5"], "--epochs"),
-    (["--count", "many"], "--count"),
-    (["--gain", "x"], "--gain"),
     (["--sizes", "1", "x"], "--sizes"),
     (["--sizes"], "--sizes"),
-    (["--fast", "yes"], "yes"),
-    (["--nonsense", "1"], "--nonsense"),
+    (["--start", "1", "2"], "--start"),
+    (["--out", ""], "--out: must name a file or folder"),
+    (["--fast", "yes"], "yes: no such flag"),
+    (["--epochs", "0"], "--epochs 0: must be at least 1 and at most 5"),
+    (["--epochs", "6"], "--epochs 6: must be at least 1 and at most 5"),
+    (["--batch_size", "-1"], "--batch_size -1: must be at least 0"),
+    (["--sizes", "4", "0"], "--sizes 0: must be at least 1"),
+    (["--rate", "nan"], "--rate nan: must be a finite number"),
+    (["--rate", "inf"], "--rate inf: must be a finite number"),
+    (["--batch-size", "1"], "--batch-size: no such flag; did you mean --batch_size?"),
+    (["--batchsize=1"], "--batchsize: no such flag; did you mean --batch_size?"),
+    (["--epoch", "4"], "--epoch: no such flag; did you mean --epochs?"),  # no abbreviations
+    (["--zzz"], "--zzz: no such flag; --help lists them"),
 ])  # fmt: skip
-def test_a_value_of_another_type_or_choice_is_one_line_that_names_the_flag(capsys, argv, named):
-    assert named in error_line(capsys, parse, *argv)
+def test_a_value_that_is_not_allowed_is_named_with_what_is(argv, says):
+    with pytest.raises(BadInput) as refused:
+        parse(*argv)
+    assert says in str(refused.value)
 
 
-def test_help_shows_the_docstring_every_flag_and_the_help_texts(capsys):
+def test_flags_made_in_python_are_checked_alike():
+    with pytest.raises(BadInput, match="--task c: must be one of a, b"):
+        logx.check_flags(Kinds(task="c"))
+
+
+def test_help_shows_the_docstring_every_flag_and_its_default(capsys):
     with pytest.raises(SystemExit) as stopped:
         parse("--help")
-    out = capsys.readouterr().out
-    assert stopped.value.code == 0 and "What it does." in out and "help of recipe" in out and "help of sizes" in out
-    assert all(f"--{name}" in out for name in vars(Flags())) and "--no-fast" in out and "--no-maybe" in out
+    out = " ".join(capsys.readouterr().out.split())
+    assert stopped.value.code == 0 and "What it does." in out and "100 % of them (default: one two)" in out
+    assert all(f"--{name}" in out for name in vars(Kinds()) if name != "set_by_hand") and "--no-maybe" in out
+    assert "set_by_hand" not in out
 
 
-@pytest.mark.parametrize("changed, message", [
-    (dict(epochs=0), "--epochs 0: must be at least 1 and at most 5"),
-    (dict(epochs=6), "--epochs 6: must be at least 1 and at most 5"),
-    (dict(count=-1), "--count -1: must be at least 0"),
-    (dict(gain=-0.5), "--gain -0.5: must be at least 0"),
-    (dict(sizes=(4, 0, 2)), "--sizes 0: must be at least 1"),
+DEFAULTS = dict(num_demos=100, lambda_bc=2.0, symmetry="gas", demo_noise=0.0, epochs=10)
+
+
+def filled(**changes):
+    return logx.fill_in(Flags(recipe="paper", **changes), DEFAULTS, "ddpg")
+
+
+def test_what_is_not_given_is_decided_by_task_and_recipe_and_what_differs_is_in_the_name():
+    flags = filled()
+    assert (flags.num_demos, flags.symmetry, flags.epochs) == (100, "gas", 10)
+    assert flags.variant == "" and flags.name == "p2p-ddpg-paper-N100-lambda2-gas-seed0"
+    flags = filled(gamma=0.9, hidden_sizes=(8, 4), num_demos=0, epochs=3, seed=5)
+    assert flags.variant == "gamma=0.9-hidden_sizes=8x4"
+    assert flags.name == "p2p-ddpg-paper-N0-lambda2-gas-gamma=0.9-hidden_sizes=8x4-epochs=3-seed5"
+    assert filled(quiet=False, device="cpu", resume=True).name == filled().name
+
+
+def test_demonstrations_of_a_file_are_named_by_it_and_not_by_how_they_would_be_recorded():
+    flags = filled(demos="some/file.npz", gains="authors", demo_noise=0.2)
+    assert (flags.variant, flags.gains, flags.demo_noise) == ("demos=file.npz", None, None)
+
+
+def test_a_long_variant_is_a_number_that_tells_variants_apart():
+    one, other = (filled(hidden_sizes=(10,) * 40, gamma=gamma) for gamma in (0.9, 0.8))
+    assert one.variant.startswith("2-changes-") and len(one.name) < 100 and one.name != other.name
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "x" * 201])
+def test_a_name_that_is_no_folders_is_refused(name):
+    with pytest.raises(BadInput, match="--name .*: must be the name of one folder"):
+        logx.fill_in(Flags(recipe="paper", name=name), DEFAULTS, "ddpg")
+
+
+# ---- exit codes ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("raised, code, line", [
+    (None, 1, ""),
+    (BadInput("--x 1:\nmust be 2"), 2, "script.py: error: --x 1: must be 2\n"),
+    (logx.NotFinite("NaN"), 3, "script.py: error: NaN\n"),
+    (KeyboardInterrupt("state saved"), 130, "script.py: state saved\n"),
+    (KeyboardInterrupt(), 130, ""),
 ])  # fmt: skip
-def test_a_number_out_of_range_is_named_with_what_is_allowed(capsys, changed, message):
-    assert error_line(capsys, logx.check_ranges, Flags(**changed)).strip().endswith(message)
+def test_a_script_ends_with_an_exit_code_and_at_most_one_line(monkeypatch, capsys, raised, code, line):
+    def main():
+        if raised:
+            raise raised
+        return 1
 
-
-@pytest.mark.parametrize("field", ["rate", "gain"])  # without bounds and with one
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_nan_and_infinity_are_out_of_every_range(capsys, field, value):
-    line = error_line(capsys, logx.check_ranges, Flags(**{field: value}))
-    assert f"--{field} {value}: must be a finite number" in line
-
-
-def test_the_bounds_themselves_and_what_is_not_given_are_in_range():
-    for changed in (dict(), dict(epochs=1), dict(epochs=5), dict(count=0, gain=0.0, sizes=(1, 1), rate=-1e9)):
-        assert logx.check_ranges(Flags(**changed)) is None
+    monkeypatch.setattr(sys, "argv", ["some/script.py"])
+    with pytest.raises(SystemExit) as ended:
+        logx.run_script(main)
+    assert ended.value.code == code and capsys.readouterr() == ("", line)
 
 
 # ---- whole files -----------------------------------------------------------------------------------------------------
@@ -147,7 +205,7 @@ def test_the_bounds_themselves_and_what_is_not_given_are_in_range():
 
 def test_atomic_write_leaves_the_old_file_whole_when_the_writer_raises(tmp_path):
     path = tmp_path / "file"
-    logx.atomic_write(path, lambda file: file.write(b"old"))
+    logx.atomic_write(path, "old")
 
     def half(file):
         file.write(b"ne")
@@ -157,18 +215,17 @@ def test_atomic_write_leaves_the_old_file_whole_when_the_writer_raises(tmp_path)
 
     with pytest.raises(RuntimeError, match="disk full"):
         logx.atomic_write(path, half)
-    assert path.read_bytes() == b"old"
-    logx.atomic_write(path, lambda file: file.write(b"new"))  # and what the failed one left is not in the way
-    assert path.read_bytes() == b"new" and [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert contents(tmp_path) == {"file": b"old"}
+    logx.atomic_write(path, b"new")
+    assert contents(tmp_path) == {"file": b"new"}
 
 
 def test_atomic_write_is_on_the_disk_before_it_is_in_place(tmp_path, monkeypatch):
-    order = []
-    fsync, replace = os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda f: order.append(("fsync", os.fstat(f).st_size)) or fsync(f))
-    monkeypatch.setattr(os, "replace", lambda a, b: order.append(("replace", str(b))) or replace(a, b))
+    order, fsync, rename = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda f: order.append(os.fstat(f).st_size) or fsync(f))
+    monkeypatch.setattr(os, "replace", lambda a, b: order.append(str(b)) or rename(a, b))
     logx.atomic_write(tmp_path / "file", lambda file: file.write(b"12345"))
-    assert order == [("fsync", 5), ("replace", str(tmp_path / "file"))]
+    assert order == [5, str(tmp_path / "file")]
 
 
 # ---- safe loading ----------------------------------------------------------------------------------------------------
@@ -178,59 +235,34 @@ class Object:
     """Not a plain type."""
 
 
-def unloadable():
-    """{what: bytes of a file that load_torch must refuse}."""
-    whole = io.BytesIO()
-    torch.save({"w": torch.arange(1000.0), "n": 3}, whole)
-    whole = whole.getvalue()
-    pickled = io.BytesIO()
-    torch.save({"w": Object()}, pickled)
-    legacy = io.BytesIO()
-    torch.save({"w": Object()}, legacy, _use_new_zipfile_serialization=False)
-    files = {f"cut at {n}": whole[:n] for n in (0, 1, 4, 100, len(whole) // 2, len(whole) - 1)}
-    return files | {
-        "an object saved by torch": pickled.getvalue(),
-        "an object in torch's old format": legacy.getvalue(),
-        "an object saved by pickle": pickle.dumps(Object()),
-        "a pickle that runs a command": b"cposix\nsystem\n(S'true'\ntR.",
-        "text": b"epoch,env_steps\n1,2000\n",
-        "one line feed": b"\n",
-        "zeros": bytes(5000),
-        "another zip": b"PK\x05\x06" + bytes(18),
-    }
+def saved(value, **options):
+    file = io.BytesIO()
+    torch.save(value, file, **options)
+    return file.getvalue()
+
+
+WHOLE = saved({"w": torch.arange(1000.0), "n": 3})
 
 
 @pytest.mark.filterwarnings("error")  # a warning is a second line on standard error
-@pytest.mark.parametrize("what", unloadable())
-def test_load_torch_refuses_with_a_line_that_names_the_file(tmp_path, what):
+@pytest.mark.parametrize("data", [
+    b"", WHOLE[:100], WHOLE[:-1], saved({"w": Object()}), saved({"w": Object()}, _use_new_zipfile_serialization=False),
+    pickle.dumps(Object()), b"cposix\nsystem\n(S'true'\ntR.", b"epoch,env_steps\n1,2000\n", bytes(5000),
+    b"PK\x05\x06" + bytes(18), np.random.default_rng(0).bytes(100),
+], ids="empty cut cut-by-one object old-object pickle command text zeros zip random".split())  # fmt: skip
+def test_load_torch_refuses_with_a_line_that_names_the_file(tmp_path, data):
     path = tmp_path / "file.pt"
-    path.write_bytes(unloadable()[what])
-    with pytest.raises(ValueError) as refused:
+    path.write_bytes(data)
+    with pytest.raises(BadInput) as refused:
         logx.load_torch(path)
-    line = str(refused.value)
-    assert line.startswith(f"{path}: cut short, or holds more than tensors") and "\n" not in line
+    assert str(refused.value).startswith(f"{path}: cut short, or holds more than tensors")
 
 
-@pytest.mark.filterwarnings("error")
-def test_load_torch_refuses_any_text_and_any_bytes(tmp_path):
-    draw = random.Random(0)
-    for alphabet in (b"abcdefghijklmnopqrstuvwxyz0123456789 ,.-()[]{}\n", bytes(range(256))):
-        for _ in range(100):
-            (tmp_path / "file.pt").write_bytes(bytes(draw.choices(alphabet, k=draw.randint(1, 100))))
-            with pytest.raises(ValueError, match="file.pt"):
-                logx.load_torch(tmp_path / "file.pt")
-
-
-def test_load_torch_says_when_there_is_no_file_and_when_it_is_a_folder(tmp_path):
-    with pytest.raises(ValueError, match=f"{tmp_path}/missing.pt: no such file"):
+def test_load_torch_says_when_there_is_no_file_and_gives_tensors_and_plain_types_back(tmp_path):
+    with pytest.raises(BadInput, match=f"{tmp_path}/missing.pt: no such file"):
         logx.load_torch(tmp_path / "missing.pt")
-    with pytest.raises(ValueError, match=f"{tmp_path}: Is a directory"):
-        logx.load_torch(tmp_path)
-
-
-def test_load_torch_gives_tensors_and_plain_types_back(tmp_path):
     state = {"t": torch.arange(3.0), "nested": [{"n": 1, "s": "x", "none": None, "yes": True, "f": 0.1}]}
-    logx.atomic_write(tmp_path / "f.pt", lambda file: torch.save(state, file))
+    (tmp_path / "f.pt").write_bytes(saved(state))
     loaded = logx.load_torch(tmp_path / "f.pt")
     assert torch.equal(loaded.pop("t"), state.pop("t")) and loaded == state
 
@@ -238,21 +270,11 @@ def test_load_torch_gives_tensors_and_plain_types_back(tmp_path):
 # ---- versions --------------------------------------------------------------------------------------------------------
 
 
-def test_versions_name_the_packages_that_are_running():
-    import platform
-
-    import gymnasium
-    import numpy
-
-    made_with = logx.versions()
-    assert made_with["python"] == platform.python_version() and made_with["torch"] == torch.__version__
-    assert made_with["numpy"] == numpy.__version__ and made_with["gymnasium"] == gymnasium.__version__
-    assert re.fullmatch(r"3\.\d+\.\d+", made_with["pybullet"])
-
-
-def test_versions_name_the_commit_and_say_dirty_where_a_tracked_file_changed(tmp_path, monkeypatch):
+def test_versions_name_the_packages_the_commit_and_whether_a_tracked_file_changed(tmp_path, monkeypatch):
     monkeypatch.setattr(logx, "__file__", str(tmp_path / "logx.py"))
-    assert logx.versions()["git_commit"] == "unknown"  # no repository
+    made_with = logx.versions()
+    assert made_with["torch"] == torch.__version__ and made_with["numpy"] == np.__version__
+    assert made_with["git_commit"] == "unknown"  # no repository
 
     def git(*argv):
         me = ["-c", "user.name=n", "-c", "user.email=e@x", "-c", "commit.gpgsign=false"]
@@ -263,7 +285,6 @@ def test_versions_name_the_commit_and_say_dirty_where_a_tracked_file_changed(tmp
     git("add", "logx.py")
     git("commit", "-q", "-m", "m")
     commit = git("rev-parse", "HEAD").strip()
-    assert logx.versions()["git_commit"] == commit
     git("tag", "-a", "v1", "-m", "m")
     assert logx.versions()["git_commit"] == commit  # not the tag's name
     (tmp_path / "logx.py").write_text("2\n")
@@ -271,236 +292,309 @@ def test_versions_name_the_commit_and_say_dirty_where_a_tracked_file_changed(tmp
 
 
 def test_versions_do_without_git_and_without_a_package(monkeypatch):
-    real = logx.version
+    def no_package(name):
+        raise logx.PackageNotFoundError(name)
 
-    def version(package):
-        if package == "pybullet":
-            raise logx.PackageNotFoundError(package)
-        return real(package)
-
-    monkeypatch.setattr(logx, "version", version)
-    assert logx.versions()["pybullet"] == "unknown"
+    monkeypatch.setattr(logx, "version", no_package)
     monkeypatch.setenv("PATH", "")
-    assert logx.versions()["git_commit"] == "unknown"
+    assert logx.versions()["pybullet"] == logx.versions()["git_commit"] == "unknown"
+
+
+# ---- the environment of a run ----------------------------------------------------------------------------------------
+
+
+def test_an_environment_loaded_in_mid_episode_goes_on_bit_for_bit():
+    def make():
+        env = gymnasium.make("KinovaP2P-v0", max_episode_steps=15, disable_env_checker=True)
+        return logx.Replayable(env, seed=3)
+
+    def step(env, n):
+        """n steps of the same actions, episodes begun as they end: what was seen."""
+        seen = []
+        for _ in range(n):
+            s, r, terminated, truncated, info = env.step(a)
+            seen.append((s.tolist(), r, info.get("episode")))
+            if terminated or truncated:
+                seen.append(env.reset()[0].tolist())
+        return seen
+
+    a = np.array([1, -0.5, 0.3, 0.1], dtype=np.float32)
+    one, other = make(), make()
+    one.reset()
+    step(one, 20)  # into the second episode
+    state = json.loads(json.dumps(one.state()))
+    assert len(state["actions"]) == 5 == len(one.episode)
+    assert np.array_equal(other.load(state), one.episode[-1][3])
+    assert step(one, 40) == step(other, 40)  # the goals of the next episodes too
+
+
+def test_the_last_step_tells_the_episodes_return_and_length_and_an_action_of_nan_ends_the_run():
+    env = logx.Replayable(gymnasium.make("KinovaP2P-v0", max_episode_steps=3, disable_env_checker=True), seed=0)
+    env.reset()
+    steps = [env.step(np.zeros(4, dtype=np.float32)) for _ in range(3)]
+    assert "episode" not in steps[1][4]
+    assert steps[2][4]["episode"] == {"r": sum(step[1] for step in steps), "l": 3}
+    with pytest.raises(logx.NotFinite):
+        env.step(np.full(4, np.nan, dtype=np.float32))
 
 
 # ---- a run's folder --------------------------------------------------------------------------------------------------
 
 
-def test_a_new_run_has_its_config_its_command_and_empty_curves(tmp_path):
-    run = begin(tmp_path / "deep" / "a", CONFIG)
-    config = json.loads(text(run.folder / "config.json"))
-    assert config.pop("command") and config.pop("versions")["torch"] == torch.__version__
-    assert config == json.loads(json.dumps(CONFIG)) and run.checkpoint is None
-    assert text(run.folder / "episodes.csv") == "episode,env_steps,return,length,success,collision\n"
-    assert text(run.folder / "progress.csv") == (
-        "epoch,env_steps,demo_env_steps,seconds,EpRet,EpLen,Success,L_O,L_BC,L_C,L_A,mask_fraction,Q_mean,Q_max,"
-        "pretanh_own,pretanh_demo,bc_relative_error,eval_success,eval_return\n")  # fmt: skip
+def test_a_new_run_has_its_flags_its_command_and_curves_with_the_columns_of_its_algorithm(tmp_path):
+    with folder_of(tmp_path / "deep" / "a") as run:
+        run.begin()
+    config = json.loads((run.folder / "config.json").read_text())
+    assert config["command"] == sys.argv and config["versions"] == logx.versions()
+    assert config["algo"] == "ddpg" and config["hidden_sizes"] == [16, 16] and config["variant"] == ""
+    assert (run.folder / "episodes.csv").read_text() == "episode,env_steps,return,length,success,collision\n"
+    assert (run.folder / "progress.csv").read_text() == (
+        "epoch,env_steps,demo_env_steps,seconds,EpRet,EpLen,Success,L_C,L_A,eval_success,eval_return\n")  # fmt: skip
 
 
-def test_write_puts_values_under_their_columns_and_leaves_none_nan_and_missing_blank(tmp_path):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"collision": "self", "episode": 1, "env_steps": 88, "return": -2.25, "length": 88,
-                           "success": 0})  # fmt: skip
-    run.write("progress", {"epoch": 1, "env_steps": 300, "EpRet": None, "L_BC": math.nan, "L_O": -1 / 3, "Q_max": 0.0})
-    assert text(run.folder / "episodes.csv").splitlines()[1] == "1,88,-2.25,88,0,self"
-    row = text(run.folder / "progress.csv").splitlines()[1]
-    assert row == "1,300,,,,,,-0.333333333,,,,,,0,,,,,"  # on the disk at once, without a save
+def test_an_epochs_row_is_the_mean_of_its_episodes_and_updates_and_blank_where_nothing_was_measured(tmp_path):
+    with folder_of(tmp_path / "a") as run:
+        run.begin(demo_env_steps=300)
+        log_episode(run, 30, success=True)
+        log_episode(run, 45)
+        run.log_updates({"L_C": 1.0, "L_A": math.nan})
+        run.log_updates({"L_C": 2.0, "L_A": math.nan})
+        run.log_epoch(50, {"eval_success": 0.5, "eval_return": -1.25})
+        run.log_epoch(100, {})
+    episodes = (run.folder / "episodes.csv").read_text().splitlines()
+    assert episodes[1:] == ["1,30,-10,30,1,", "2,45,-15,45,0,self"]
+    first, second = (line.split(",") for line in (run.folder / "progress.csv").read_text().splitlines()[1:])
+    assert first[:3] + first[4:] == ["1", "50", "300", "-12.5", "37.5", "0.5", "1.5", "", "0.5", "-1.25"]
+    assert second[:3] + second[4:] == ["2", "100", "300"] + [""] * 7  # the next epoch begins with nothing
 
 
-def test_a_resume_cuts_both_curves_back_to_the_checkpoint_and_goes_on_from_there(tmp_path):
-    run = begin(tmp_path / "a", CONFIG)
-    for n in (1, 2):
-        run.write("episodes", {"episode": n})
-    run.write("progress", {"epoch": 1})
-    run.save({"tensor": torch.arange(3)}, CONFIG, {})
-    run.write("episodes", {"episode": 3})
-    run.write("progress", {"epoch": 2})
-    close(run)
-    with open(tmp_path / "a" / "episodes.csv", "a") as file:
+@pytest.mark.parametrize("measured", [{"L_C": math.nan, "L_A": 0.0}, {"L_C": 0.0, "L_A": math.inf}])
+def test_a_loss_that_is_not_finite_ends_the_run_and_says_how_to_go_on(tmp_path, measured):
+    with folder_of(tmp_path / "a") as run, pytest.raises(logx.NotFinite, match="--resume"):
+        run.begin()
+        run.log_updates(measured)
+
+
+def test_the_table_is_said_unless_quiet_and_standard_error_is_silent_where_it_is_no_terminal(tmp_path, capsys):
+    for quiet in (True, False):
+        with folder_of(tmp_path / str(quiet), quiet=quiet) as run:
+            run.begin(demo_env_steps=1234)
+            log_episode(run, 50, success=True)
+            run.log_epoch(50, {})
+        out, err = capsys.readouterr()
+        assert err == "" and bool(out) is not quiet
+    title, heads, row = out.splitlines()
+    assert title == f"{run.folder}: 200 steps, 1,234 of the demonstrator"
+    assert dict(zip(heads.replace(" %", "%").split(), row.split(), strict=True)) == {
+        "test%": "–", "epoch": "1", "steps": "50", "EpRet": "-16.67", "train%": "100", "EpLen": "50"}  # fmt: skip
+
+
+def test_a_resume_cuts_the_curves_back_to_the_checkpoint_and_goes_on_from_there(stopped):
+    with open(stopped / "episodes.csv", "a") as file:
         file.write("4,3")  # a row cut off by a kill
-    again = begin(tmp_path / "a", CONFIG, resume=True)
-    assert torch.equal(again.checkpoint["tensor"], torch.arange(3))
-    assert [line.split(",")[0] for line in text(tmp_path / "a" / "episodes.csv").splitlines()] == ["episode", "1", "2"]
-    assert [line.split(",")[0] for line in text(tmp_path / "a" / "progress.csv").splitlines()] == ["epoch", "1"]
-    again.write("episodes", {"episode": 3})
-    assert text(tmp_path / "a" / "episodes.csv").endswith("\n2,,,,,\n3,,,,,\n")
+    with folder_of(stopped, resume=True) as run:
+        assert run.checkpoint["t"] == 50 and torch.equal(run.checkpoint["tensor"], torch.arange(3))
+        assert not run.finished()
+        run.begin()
+        assert first_column(stopped / "episodes.csv") == ["episode", "1", "2"]
+        assert first_column(stopped / "progress.csv") == ["epoch", "1"]
+        log_episode(run, 60)
+        run.log_epoch(100, {})
+    assert (stopped / "episodes.csv").read_text().splitlines()[-1] == "3,60,-20,60,0,self"
+    assert (stopped / "progress.csv").read_text().splitlines()[-1].startswith("2,100,7,")  # its demonstrations too
 
 
-def test_a_run_is_new_until_it_has_a_checkpoint(tmp_path):
-    assert logx.is_new(tmp_path / "a", False) and logx.is_new(tmp_path / "a", True)
-    (tmp_path / "a").mkdir()
-    assert logx.is_new(tmp_path / "a", False) and logx.is_new(tmp_path / "a", True)
-    run = begin(tmp_path / "a", CONFIG)
-    assert logx.is_new(tmp_path / "a", True)
-    run.save({}, CONFIG, {})
-    assert not logx.is_new(tmp_path / "a", True)
+def test_a_resume_without_a_checkpoint_begins_a_new_run_and_says_so(tmp_path, capsys):
+    with folder_of(tmp_path / "a") as run:
+        run.begin()
+        log_episode(run, 20)
+    with folder_of(tmp_path / "a", resume=True, quiet=False) as run:
+        assert run.checkpoint is None
+        run.begin()
+    assert first_column(tmp_path / "a" / "episodes.csv") == ["episode"]
+    assert capsys.readouterr().out.startswith(f"{run.folder}: no checkpoint there, so this begins a new run\n")
 
 
-def test_a_resume_without_a_checkpoint_starts_anew(tmp_path):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    close(run)
-    again = begin(tmp_path / "a", CONFIG, resume=True)
-    assert again.checkpoint is None and text(tmp_path / "a" / "episodes.csv").count("\n") == 1
+def test_a_run_at_its_end_is_finished_and_goes_on_with_more_epochs(stopped, capsys):
+    with folder_of(stopped, resume=True, epochs=1) as run:
+        assert run.finished() and "finished, 50 steps; more with --epochs" in capsys.readouterr().out
+    with folder_of(stopped, resume=True, epochs=9) as run:
+        assert not run.finished()
+        run.begin()
+    assert json.loads((stopped / "config.json").read_text())["epochs"] == 9
 
 
-def test_the_seconds_of_a_resumed_run_include_the_earlier_parts(tmp_path, monkeypatch):
+def test_the_seconds_of_a_resumed_run_include_the_earlier_parts_and_no_clock_that_jumps(tmp_path, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(logx.time, "monotonic", lambda: now[0])
-    run = begin(tmp_path / "a", CONFIG)
-    now[0] += 7
-    run.save({}, CONFIG, {})
-    now[0] += 1000  # not the run's
-    close(run)
-    again = begin(tmp_path / "a", CONFIG, resume=True)
-    now[0] += 5
-    assert again.seconds() == 12
+    with folder_of(tmp_path / "a") as run:
+        run.begin()
+        now[0] += 7
+        run.save({"t": 1}, {})
+        now[0] += 1000  # not the run's
+    with folder_of(tmp_path / "a", resume=True) as run:
+        run.begin()
+        now[0] += 5
+        assert run.seconds() == 12
 
 
-def test_a_run_is_not_begun_twice_in_one_folder_but_by_a_resume(tmp_path, capsys):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    close(run)
-    before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
-    line = error_line(capsys, begin, tmp_path / "a", CONFIG)
-    assert "--resume" in line and "--name" in line
-    assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
+def test_a_folder_with_a_run_is_not_begun_again_but_by_a_resume(stopped):
+    before = contents(stopped)
+    with pytest.raises(BadInput, match="--name a: .* exists; go on with --resume, or choose another --name"):
+        folder_of(stopped)
+    assert contents(stopped) == before
 
 
-def test_a_run_that_is_held_is_refused_until_it_is_let_go(tmp_path, capsys):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    assert "another process" in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
-    assert text(tmp_path / "a" / "episodes.csv").endswith("\n1,,,,,\n")  # the refused one touched nothing
-    close(run)
-    assert begin(tmp_path / "a", CONFIG, resume=True).checkpoint is None
+def test_a_folder_that_is_held_is_refused_from_the_first_moment_until_it_is_let_go(tmp_path):
+    with folder_of(tmp_path / "a"):
+        with pytest.raises(BadInput, match="--name a: another process is running"):
+            folder_of(tmp_path / "a", resume=True)
+        assert contents(tmp_path / "a") == {"lock": b""}
+    with folder_of(tmp_path / "a", resume=True) as run:
+        run.begin()
 
 
-@pytest.mark.parametrize("key, value", [("gamma", 0.9), ("seed", 1), ("hidden_sizes", (16, 8)), ("task", "pnp")])
-def test_a_checkpoint_goes_on_only_with_the_flags_it_was_made_with(tmp_path, capsys, key, value):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    run.save({}, CONFIG, {})
-    run.write("episodes", {"episode": 2})
-    close(run)
-    before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
-    line = error_line(capsys, begin, tmp_path / "a", CONFIG | {key: value}, resume=True)
-    assert f"--{key}" in line
-    assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
+def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path):
+    with pytest.raises(BadInput, match="no demonstrations"), folder_of(tmp_path / "a"):
+        raise BadInput("no demonstrations")
+    assert not list(tmp_path.iterdir())
 
 
-def test_how_long_how_loud_and_where_may_change_on_a_resume(tmp_path):
-    run = begin(tmp_path / "a", CONFIG)
-    run.save({}, CONFIG, {})
-    close(run)
-    changed = CONFIG | dict(epochs=9, name="b", quiet=True, data_dir="x", resume=True, checkpoint_every=2)
-    again = begin(tmp_path / "a", changed, resume=True)
-    assert again.checkpoint is not None and json.loads(text(tmp_path / "a" / "config.json"))["epochs"] == 9
+@pytest.mark.parametrize("changes, says", [
+    (dict(gamma=0.9), "made with --gamma 0.99, not 0.9"), (dict(hidden_sizes=(16, 8)), "made with --hidden_sizes"),
+    (dict(algo="ppo"), "a run of ddpg, not of ppo"),
+    (dict(fixed_length=True, epochs=9), "made with --epochs 4, not 9, and learning rates that fall over its length"),
+])  # fmt: skip
+def test_a_checkpoint_goes_on_only_as_the_run_it_was_made_by(stopped, changes, says):
+    before = contents(stopped)
+    with pytest.raises(BadInput, match=f"--resume: .*checkpoint.pt: {says}"):
+        folder_of(stopped, resume=True, **changes)
+    assert contents(stopped) == before
+    with folder_of(stopped, resume=True, fixed_length=True, quiet=False):  # and is let go
+        pass
 
 
-def test_a_broken_checkpoint_is_named_and_the_curves_are_left_alone(tmp_path, capsys):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    run.save({"t": torch.zeros(100)}, CONFIG, {})
-    close(run)
-    path = tmp_path / "a" / "checkpoint.pt"
-    path.write_bytes(path.read_bytes()[:-50])
-    assert str(path) in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
-    assert text(tmp_path / "a" / "episodes.csv").endswith("\n1,,,,,\n")
+def spoil(name, data):
+    """Something to do to a run's folder: data in place of the file `name`, None for nothing."""
+
+    def change(folder):
+        (folder / name).unlink()
+        if data is not None:
+            (folder / name).write_bytes(data)
+
+    return change
 
 
-@pytest.mark.parametrize("shorten", [Path.unlink, lambda p: p.write_bytes(p.read_bytes()[:-3])], ids=["gone", "cut"])
-def test_a_curve_shorter_than_its_checkpoint_is_refused_by_name(tmp_path, capsys, shorten):
-    run = begin(tmp_path / "a", CONFIG)
-    run.write("episodes", {"episode": 1})
-    run.save({}, CONFIG, {})
-    close(run)
-    shorten(tmp_path / "a" / "episodes.csv")
-    assert "episodes.csv" in error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
+@pytest.mark.parametrize("change, says", [
+    (spoil("config.json", b"{"), "config.json"), (spoil("config.json", b"[]"), "config.json"),
+    (spoil("config.json", None), "config.json"), (spoil("episodes.csv", None), "episodes.csv is gone or shorter"),
+    (spoil("progress.csv", b"epoch"), "progress.csv is gone or shorter"),
+    (spoil("checkpoint.pt", b"half a file"), "checkpoint.pt: cut short"),
+    (spoil("checkpoint.pt", saved({"format": logx.FORMAT})), "checkpoint.pt: of another version"),
+    (spoil("checkpoint.pt", saved([1])), "checkpoint.pt: of another version"),
+], ids="cut list gone curve-gone curve-cut checkpoint-cut checkpoint-parts checkpoint-list".split())  # fmt: skip
+def test_a_folder_that_cannot_be_gone_on_with_is_refused_by_the_name_of_the_file(stopped, change, says):
+    change(stopped)
+    before = contents(stopped)
+    with pytest.raises(BadInput, match=f"--resume: .*{says}"):
+        folder_of(stopped, resume=True)
+    assert contents(stopped) == before
 
 
 @pytest.mark.parametrize("where", ["file/a", "file", "x" * 300])
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys, where):
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path, where):
     (tmp_path / "file").write_text("")
-    line = error_line(capsys, begin, tmp_path / where, CONFIG)
-    assert "--data_dir" in line or "--name" in line
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    with pytest.raises(BadInput, match="--data_dir|--name"):
+        folder_of(tmp_path / where)
+    assert contents(tmp_path) == {"file": b""}
 
 
-def test_tensorboard_that_is_not_installed_is_bad_input_and_leaves_no_folder(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(logx.sys.modules, "torch.utils.tensorboard", None)
-    assert "--tensorboard" in error_line(capsys, begin, tmp_path / "a", CONFIG, tensorboard=True)
+def test_tensorboard_that_is_not_installed_is_refused_and_leaves_no_folder(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(BadInput, match="--tensorboard: needs the tensorboard package"):
+        folder_of(tmp_path / "a", tensorboard=True)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_resume_with_other_versions_is_on_record_and_the_first_ones_stay(tmp_path, monkeypatch):
-    def record(commit, **changes):
+    def record(commit, epochs=4):
         monkeypatch.setattr(logx, "versions", lambda: {"git_commit": commit})
-        logx.Run(tmp_path / "run", CONFIG | changes).save({}, CONFIG | changes, {})
-        return json.loads((tmp_path / "run" / "config.json").read_text())
+        with folder_of(tmp_path / "a", resume=True, epochs=epochs) as run:
+            run.begin()
+            run.save({"t": 1}, {})
+        return json.loads((run.folder / "config.json").read_text())
 
-    assert record("one")["versions"] == {"git_commit": "one"}
-    assert "resumed_with" not in record("one")
-    assert record("two")["resumed_with"] == [{"git_commit": "two"}]
-    assert record("two")["resumed_with"] == [{"git_commit": "two"}]
-    longer = record("one", epochs=CONFIG["epochs"] + 1)
-    assert longer["epochs"] == CONFIG["epochs"] + 1 and longer["versions"] == {"git_commit": "one"}
-    assert longer["resumed_with"] == [{"git_commit": "two"}, {"git_commit": "one"}]
-
-
-def test_a_checkpoint_of_another_format_is_refused_by_name(tmp_path, capsys, monkeypatch):
-    logx.Run(tmp_path / "run", CONFIG).save({}, CONFIG, {})
-    monkeypatch.setattr(logx, "FORMAT", logx.FORMAT + 1)
-    with pytest.raises(SystemExit) as stopped:
-        logx.Run(tmp_path / "run", CONFIG)
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert "checkpoint.pt" in error and "another version" in error and error.count("\n") == 1
+    one, two = {"git_commit": "one"}, {"git_commit": "two"}
+    assert record("one")["versions"] == one and "resumed_with" not in record("one")
+    assert record("two")["resumed_with"] == [two] == record("two")["resumed_with"]
+    longer = record("two", epochs=5)
+    assert (longer["epochs"], longer["versions"], longer["resumed_with"]) == (5, one, [two])
+    assert record("one", epochs=5)["resumed_with"] == [two, one]
 
 
-def test_seconds_do_not_follow_a_clock_that_jumps_back(tmp_path, monkeypatch):
-    run = logx.Run(tmp_path / "run", CONFIG)
-    monkeypatch.setattr(time, "time", lambda: -1e9)
-    assert 0 <= run.seconds() < 100
+@pytest.mark.parametrize("number", logx.STOP_SIGNALS)
+def test_a_signal_asks_a_begun_run_to_stop_and_ends_one_that_has_nothing_to_save(tmp_path, number):
+    before = signal.getsignal(number)
+    with folder_of(tmp_path / "a") as run:
+        run.begin()
+        os.kill(os.getpid(), number)
+        assert run.stop_signals == [number]
+    assert signal.getsignal(number) == before
+    with pytest.raises(KeyboardInterrupt), folder_of(tmp_path / "b"):
+        os.kill(os.getpid(), number)
+    assert not (tmp_path / "b").exists()
 
 
-def spoiled(name, content):
-    """Something to do to a run's folder: `content` in place of the file `name`, None for nothing, "/" for a folder."""
+def test_a_run_in_a_thread_leaves_signals_alone(tmp_path):
+    def in_thread():
+        with folder_of(tmp_path / "a") as run:
+            run.begin()
+            seen.append(signal.getsignal(signal.SIGTERM))
 
-    def spoil(folder):
-        (folder / name).unlink()
-        if content == "/":
-            (folder / name).mkdir()
-        elif content is not None:
-            (folder / name).write_bytes(content)
-
-    return spoil
-
-
-def stored(value):
-    file = io.BytesIO()
-    torch.save(value, file)
-    return file.getvalue()
+    seen = [signal.getsignal(signal.SIGTERM)]
+    thread = threading.Thread(target=in_thread)
+    thread.start()
+    thread.join()
+    assert len(seen) == 2 and seen[0] == seen[1]
 
 
-@pytest.mark.parametrize("spoil, says", [
-    (spoiled("config.json", b"{"), "config.json"), (spoiled("config.json", b"[]"), "config.json"),
-    (spoiled("config.json", b"{}"), "config.json"), (spoiled("config.json", None), "config.json"),
-    (spoiled("checkpoint.pt", stored([1])), "another version"),
-    (spoiled("checkpoint.pt", stored({"format": logx.FORMAT})), "another version"),
-], ids=["cut", "a list", "empty", "gone", "a checkpoint that is a list", "a checkpoint without its parts"])  # fmt: skip
-def test_a_folder_that_cannot_be_gone_on_with_is_one_line(tmp_path, capsys, spoil, says):
-    run = begin(tmp_path / "a", CONFIG)
-    run.save({}, CONFIG, {})
-    close(run)
-    spoil(tmp_path / "a")
-    error = error_line(capsys, begin, tmp_path / "a", CONFIG, resume=True)
-    assert "--resume" in error and says in error and "go on from its last" not in error
+def test_resume_of_a_folder_takes_the_flags_of_the_run_there_and_what_is_asked_now(stopped, monkeypatch):
+    for folder, inside in ((stopped, stopped.parent), (".", stopped), (stopped.name, stopped.parent)):
+        monkeypatch.chdir(inside)
+        flags = logx.recorded(Flags(resume=str(folder), epochs=9, gamma=0.9))
+        assert (flags.epochs, flags.gamma, flags.hidden_sizes, flags.resume) == (9, 0.9, (16, 16), True)
+        assert (Path(flags.data_dir) / flags.name).resolve() == stopped.resolve()
+    assert logx.recorded(Flags(resume=True)) == Flags(resume=True)
 
 
-def test_a_run_of_the_other_algorithm_is_refused_by_its_name(tmp_path, capsys):
-    run = begin(tmp_path / "a", CONFIG | {"algo": "ddpg", "act_noise": 0.1})
-    run.save({}, CONFIG | {"algo": "ddpg", "act_noise": 0.1}, {})
-    close(run)
-    assert "a run of ddpg, not of ppo" in error_line(capsys, begin, tmp_path / "a", CONFIG | {"algo": "ppo"}, True)
+@pytest.mark.parametrize("name, data, says", [
+    ("checkpoint.pt", None, "No such file"), ("config.json", None, "No such file"), ("config.json", b"{", "Expecting"),
+    ("config.json", b"[]", "no attribute"), ("config.json", b"{}", "config.json lacks act_noise"),
+])  # fmt: skip
+def test_resume_of_a_folder_without_a_run_to_go_on_with_is_refused(stopped, name, data, says):
+    spoil(name, data)(stopped)
+    with pytest.raises(BadInput, match=f"--resume {stopped}: must be a run's folder with a checkpoint .*{says}"):
+        logx.recorded(Flags(resume=str(stopped)))
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("kilobytes", [8, 40])  # too small for a checkpoint, and for the curves of a long run
+def test_a_full_disk_ends_the_run_with_bad_input_and_what_was_saved_stays(tmp_path, kilobytes):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", disk], check=True)
+    try:
+        says = "cannot write .*; go on from its last checkpoint"
+        with pytest.raises(BadInput, match=says), folder_of(disk / "a") as run:
+            run.begin()
+            for t in range(1, 10_000):
+                log_episode(run, t)
+                if t % 100 == 0:
+                    run.save({"t": t, "tensor": torch.zeros(1000)}, {})
+        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True)
+        with folder_of(disk / "a", resume=True) as run:
+            known = run.checkpoint["t"] if run.checkpoint else 0
+            run.begin()
+            assert len(first_column(run.folder / "episodes.csv")) == 1 + known and bool(known) == (kilobytes == 40)
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
