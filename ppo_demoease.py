@@ -331,7 +331,7 @@ class Learner:
             i = torch.randint(len(s), (min(f.batch_size, len(s)),)).to(f.device)
             mu, own_i = net.mu(s[i]), own[i] > 0
             with torch.no_grad():
-                D_KL = kl_divergence(gaussian(mu_old[i][own_i], sigma_old), net.pi(mu[own_i])).mean()
+                D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), net.pi(mu))[own_i].mean()  # NaN without own ones
             if f.target_kl <= D_KL:
                 within_kl = False
             if not within_kl and f.after_kl == "none":
