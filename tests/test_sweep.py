@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -286,3 +287,11 @@ def test_cluster_without_submitit_or_without_slurm_is_bad_input(tmp_path, monkey
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(logx.BadInput, match="^--cluster slurm: needs submitit"):
         sweep.main(flags)
+
+
+# ---- the project -----------------------------------------------------------------------------------------------------
+
+
+def test_installation_in_place_knows_every_script():
+    modules = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["py-modules"]
+    assert {path.stem for path in ROOT.glob("*.py")} <= set(modules)
