@@ -2,9 +2,8 @@
 
     python sweep.py --task p2p --dry_run            # the commands, and the cost
     python sweep.py --task p2p --recipe robust --jobs 2       # two at a time
-    python sweep.py --task p2p --columns lambda=1.8 baseline --seeds 2
-    python sweep.py --task p2p --columns lambda=1.8 --recipe robust \\
-        --vary symmetry=none,gas num_demos=4,8      # four runs for each seed
+    python sweep.py --task p2p --columns lambda=1.8 baseline --seeds 2 \\
+        --vary symmetry=none,gas gamma=0.98,0.99        # 16 runs
     python sweep.py --status                        # how far each run is
     python sweep.py --cluster slurm --partition cpu --time 600
 
