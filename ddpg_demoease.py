@@ -34,7 +34,7 @@ from logx import flag
 
 
 @dataclass
-class Flags:
+class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
@@ -76,24 +76,12 @@ class Flags:
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
     clip_target: bool | None = flag(None, "clip targets to the range of possible returns")
     lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
-    # the run
-    name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
-    data_dir: str = flag("data/runs", "where run folders lie")
-    resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
-    device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
-    eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
-    eval_trials: int = flag(50, "how many of them", low=1)
-    checkpoint_every: int = flag(5, "epochs between checkpoints", low=1)
-    quick: bool = flag(False, "the robust recipe, then test trials and a GIF of the agent")
-    quiet: bool = flag(False, "no progress bar and table")
-    tensorboard: bool = flag(False, "write TensorBoard's files too")
-    variant: str = ""  # what differs from the recipe; set by resolve
 
 
 TASK_DEFAULTS = {  # Table 1, Sec. 4.2; the paper trains pnp with PPO: its sizes, 250 epochs (ours)
-    "p2p": dict(max_ep_len=400, epochs=250, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
-    "p2po": dict(max_ep_len=500, epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
-    "pnp": dict(max_ep_len=800, epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
+    "p2p": dict(epochs=250, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
+    "p2po": dict(epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
+    "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
              normalize_obs=False, hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False,
@@ -107,9 +95,10 @@ ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs
 
 def recipe_defaults(task, recipe, max_ep_len=None):
     """{flag: value} of all that task and recipe decide."""
-    T = max_ep_len or TASK_DEFAULTS[task]["max_ep_len"]
-    schedule = dict(steps_per_epoch=5 * T, update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
-    return TASK_DEFAULTS[task] | schedule | (PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task])
+    T = max_ep_len or TASKS[task].horizon
+    defaults = TASK_DEFAULTS[task] | dict(max_ep_len=T, steps_per_epoch=5 * T, update_every=max(1, T // 20))
+    defaults |= dict(start_steps=2 * T, update_after=T)
+    return defaults | (PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task])
 
 
 def resolve(flags):
@@ -470,14 +459,10 @@ def loop(f, run):
 
         # log
         if t % f.steps_per_epoch == 0:
-            epoch, last = t // f.steps_per_epoch, t == run.total_steps
-            due = f.eval_every and (epoch % f.eval_every == 0 or last)
-            run.log_epoch(t, evaluate.while_training(learner.policy(), f) if due else {})
-            if epoch % f.checkpoint_every == 0 or last:
-                save()
-        if run.stop_signals and t < run.total_steps:
+            run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
+        if run.must_save(t):
             save()
-            raise KeyboardInterrupt(f"{run.folder}: stopped at step {t}, state saved; go on with --resume")
+            run.stop_if_asked(t)
     env.close()
 
 

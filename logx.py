@@ -96,6 +96,23 @@ def path(text):
     return Path(text)
 
 
+@dataclasses.dataclass
+class RunFlags:
+    """The flags of every run, whatever the algorithm."""
+
+    name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
+    data_dir: str = flag("data/runs", "where run folders lie")
+    resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
+    device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
+    eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
+    eval_trials: int = flag(50, "how many of them", low=1)
+    checkpoint_every: int = flag(5, "epochs between checkpoints", low=1)
+    quick: bool = flag(False, "the robust recipe, then test trials and a GIF of the agent")
+    quiet: bool = flag(False, "no progress bar and table")
+    tensorboard: bool = flag(False, "write TensorBoard's files too")
+    variant: str = ""  # what differs from the recipe; set by fill_in
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message):
         raise BadInput(message)
@@ -110,7 +127,7 @@ def parse_flags(cls, doc, argv=None):
     parser = _Parser(description=doc, usage=argparse.SUPPRESS, allow_abbrev=False,
                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     hints = typing.get_type_hints(cls)
-    for field in dataclasses.fields(cls):
+    for field in sorted(dataclasses.fields(cls), key=lambda field: field.name not in cls.__annotations__):
         if not field.metadata:
             continue
         about, kind = field.metadata, hints[field.name]
@@ -526,9 +543,11 @@ class RunFolder:
                             "checkpoint with --resume, or begin anew with smaller learning rates")  # fmt: skip
         self._log["epoch_updates"].append(measured)
 
-    def log_epoch(self, env_steps, evaluation):
-        """One line of progress.csv and of the table. evaluation: {"eval_success", "eval_return"} or {}."""
-        row = {"epoch": env_steps // self.flags.steps_per_epoch, "env_steps": env_steps,
+    def log_epoch(self, env_steps, evaluate):
+        """One line of progress.csv and of the table. evaluate(): {"eval_success", "eval_return"}, where it is due."""
+        last, epoch = env_steps == self.total_steps, env_steps // self.flags.steps_per_epoch
+        due = self.flags.eval_every and (last or epoch % self.flags.eval_every == 0)
+        row = {"epoch": epoch, "env_steps": env_steps,
                "demo_env_steps": self._log["demo_env_steps"], "seconds": self.seconds()}  # fmt: skip
         if episodes := self._log["epoch_episodes"]:
             row |= zip(("EpRet", "EpLen", "Success"), np.mean(episodes, axis=0).tolist(), strict=True)
@@ -536,7 +555,7 @@ class RunFolder:
             known = [m[name] for m in self._log["epoch_updates"] if not math.isnan(m[name])]
             row[name] = float(np.mean(known)) if known else None
         self._log["epoch_episodes"], self._log["epoch_updates"] = [], []
-        row |= evaluation
+        row |= evaluate() if due else {}
         self._write("progress", row)
         percent = {name: 100 * row[name] for name in ("eval_success", "Success") if name in row}
         cells = [(row | percent).get(c) for c in self._shown]
@@ -546,6 +565,18 @@ class RunFolder:
         for column, v in row.items() if self._board else ():
             if v is not None:
                 self._board.add_scalar(column, v, env_steps)
+
+    def must_save(self, env_steps):
+        """Whether a checkpoint is due, or the run was asked to stop."""
+        epoch, of_epoch = divmod(env_steps, self.flags.steps_per_epoch)
+        due = of_epoch == 0 and (epoch % self.flags.checkpoint_every == 0 or env_steps == self.total_steps)
+        return due or bool(self.stop_signals)
+
+    def stop_if_asked(self, env_steps):
+        """After a save: raises KeyboardInterrupt where the run was asked to stop before its end."""
+        if self.stop_signals and env_steps < self.total_steps:
+            text = f"{self.folder}: stopped at step {env_steps}, state saved; go on with --resume"
+            raise KeyboardInterrupt(text)
 
     def seconds(self):
         """Wall-clock seconds of the run, earlier parts included."""

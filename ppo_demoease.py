@@ -33,7 +33,7 @@ from logx import flag
 
 
 @dataclass
-class Flags:
+class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("pnp", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
@@ -71,24 +71,12 @@ class Flags:
     normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d")
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; pnp only")
     clip_value: bool | None = flag(None, "clip V to the range of possible returns")
-    # the run
-    name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
-    data_dir: str = flag("data/runs", "where run folders lie")
-    resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
-    device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
-    eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
-    eval_trials: int = flag(50, "how many of them", low=1)
-    checkpoint_every: int = flag(5, "epochs between checkpoints", low=1)
-    quick: bool = flag(False, "the robust recipe, then test trials and a GIF of the agent")
-    quiet: bool = flag(False, "no progress bar and table")
-    tensorboard: bool = flag(False, "write TensorBoard's files too")
-    variant: str = ""  # what differs from the recipe; set by resolve
 
 
 TASK_DEFAULTS = {  # Table 2, Sec. 4.2; the paper trains p2p and p2po with DDPG: their sizes
-    "p2p": dict(max_ep_len=400, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
-    "p2po": dict(max_ep_len=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
-    "pnp": dict(max_ep_len=800, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
+    "p2p": dict(num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
+    "p2po": dict(num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
+    "pnp": dict(num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(epochs=50, symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, pi_lr=3e-4, log_std=-0.5,
              mask="reward", demos_in_B_o=True, demo_noise=0.0, clone_iters=0, after_kl="none", normalize_obs=False,
@@ -103,7 +91,7 @@ def recipe_defaults(task, recipe, num_demos=None):
     defaults = TASK_DEFAULTS[task] | (PAPER if recipe == "paper" else ROBUST)
     N = defaults["num_demos"] if num_demos is None else num_demos
     defaults["demos_per_epoch"] = max(1, math.ceil(N / 5) if recipe == "paper" else N)
-    return defaults | {"grasp_input": defaults["grasp_input"] and task == "pnp"}
+    return defaults | {"max_ep_len": TASKS[task].horizon, "grasp_input": defaults["grasp_input"] and task == "pnp"}
 
 
 def resolve(flags):
@@ -462,14 +450,10 @@ def loop(f, run):
                 run.log_updates(measured)
             B_o.filled = 0
             shown = open_epoch(shown)
-            epoch, last = t // f.steps_per_epoch, t == run.total_steps
-            due = f.eval_every and (epoch % f.eval_every == 0 or last)
-            run.log_epoch(t, evaluate.while_training(learner.policy(), f) if due else {})
-            if epoch % f.checkpoint_every == 0 or last:
-                save()
-        if run.stop_signals and t < run.total_steps:
+            run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
+        if run.must_save(t):
             save()
-            raise KeyboardInterrupt(f"{run.folder}: stopped at step {t}, state saved; go on with --resume")
+            run.stop_if_asked(t)
     env.close()
 
 
