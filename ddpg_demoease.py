@@ -96,8 +96,8 @@ ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs
 def recipe_defaults(task, recipe, max_ep_len=None):
     """{flag: value} of all that task and recipe decide."""
     T = max_ep_len or TASKS[task].horizon
-    defaults = TASK_DEFAULTS[task] | dict(max_ep_len=T, steps_per_epoch=5 * T, update_every=max(1, T // 20))
-    defaults |= dict(start_steps=2 * T, update_after=T)
+    defaults = TASK_DEFAULTS[task] | dict(max_ep_len=TASKS[task].horizon, steps_per_epoch=5 * T)
+    defaults |= dict(update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
     return defaults | (PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task])
 
 
