@@ -1,0 +1,557 @@
+"""The runs in data/ as tables: read, grouped, measured as in the paper (Sec. 5).
+
+    runs, remarks = tables.find_runs()          # a DataFrame, one row a run
+    lines, notes, frame = tables.make_table("test", "p2p", runs)
+
+plot_curves.py prints and draws what is here. Runs of one algorithm, recipe,
+symmetry, variant (flags that differ from the recipe's) and length are a group;
+groups are never averaged together.
+
+Training metrics (Sec. 5.1), per seed, over the agent's own episodes:
+    R10, R90  mean return of the first, the last tenth of n: ceil(n / 10)
+    I_R       R90 - R10, which the paper rounds otherwise in three cells
+    T50       first episode at which the mean of the last 50 returns exceeds
+              R90 / 2, N/A where there is none or R90 <= 0. The paper's rule
+              is another: it prints 655 where its R90 is negative.
+Test metrics (Sec. 5.2): evaluate.py. Then the mean over seeds and its 95 %
+interval by Student's t; of a single seed none in training, and in the test the
+one over its trials, which knows nothing of other seeds.
+"""
+
+import json
+import math
+import os
+import re
+import zipfile
+import zlib
+from contextlib import contextmanager
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import evaluate
+import logx
+from kinova_env import INDEX, TASKS
+from logx import BadInput
+
+HERE = Path(__file__).resolve().parent
+PAPER, RESULTS = HERE / "data/paper", HERE / "data/results"
+RUNS = (HERE / "data/runs", Path("data/runs"))
+TITLES = {"p2p": "P2P", "p2po": "P2P-O", "pnp": "P&P"}
+NUMBERS = {"training": {"p2p": "Table 4", "p2po": "Table 5", "pnp": "Table 3"},
+           "test": {"p2p": "Table 6", "p2po": "Table 7", "pnp": "Table 8"}}  # fmt: skip
+METRICS = {"training": {"R10": 2, "R90": 2, "I_R": 2, "T50": 0},  # and the decimals that the paper prints
+           "test": {"P_scs_percent": 1, "T_eff": 1, "R_test": 2, "E_95_cm": 2}}  # fmt: skip
+RANKED = {"training": "R90", "test": "P_scs_percent"}  # the metric by which columns are compared
+COMPARED = {"ablations": "variant", "symmetries": "symmetry"}  # tables of groups that differ in this alone
+GROUP = ["algo", "recipe", "symmetry", "variant", "total_env_steps"]
+COLUMN = ["algo", "num_demos", "lambda_bc"]  # what the paper varies
+BEST = "best evaluation in training"
+WINDOW = 50  # episodes of the running mean, in T50 and in the figures
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def reading(path, expected):
+    """Around a reader of `path`: whatever is wrong with the file becomes one line that names it."""
+    try:
+        yield
+    except BadInput:
+        raise
+    except (OSError, EOFError, LookupError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        problem = "no such file" if isinstance(error, FileNotFoundError) else logx.one_line(error)
+        raise BadInput(f"{path}: {problem}; {expected} expected") from None
+
+
+def read_csv(path, numbers):
+    """DataFrame of a CSV file, or of the one with .gz behind its name. `numbers`: columns that are never blank."""
+    with reading(path, f"a table with numbers in {', '.join(numbers)}"):
+        table = pd.read_csv(path if path.exists() else path.with_name(f"{path.name}.gz"))
+        known = np.isfinite(table[list(numbers)].astype(float)).all(axis=1)
+        if not known[:-1].all():  # the last line may be cut short: its run is writing it
+            raise ValueError(f"no number in line {known.argmin() + 2}")
+        return table[known]
+
+
+def split(values, length):
+    """values (sum(length + 1), ...), of t = 0 ... length of one episode after another, as a list of one each."""
+    if len(values) != np.sum(length + 1):
+        raise ValueError("its arrays do not fit together")
+    return np.split(values, np.cumsum(length + 1)[:-1])
+
+
+def read_errors(path):
+    """||e_t|| in m (length + 1,) of each successful trial in a trajectories.npz."""
+    with reading(path, "a trajectories.npz of evaluate.py"), np.load(path, allow_pickle=False) as file:
+        errors = split(file["error"], file["length"])
+        return [error for error, success in zip(errors, file["success"], strict=True) if success]
+
+
+def read_paths(path):
+    """(task or None, TCP paths) in a trajectories.npz, a demos-TASK.npz, or a file of pid_demo.py --record: dicts with
+    `tcp` (length + 1, 3), `goal`, `object` (3,), in m, NaN where there is none, and `success`."""
+    with reading(path, "an .npz of evaluate.py, or of pid_demo.py --record"), np.load(path, allow_pickle=False) as file:
+        task, length = None, file["length"]
+        if "obs" in file:
+            task = json.loads(str(file["meta"]))["task"]
+            at, ends = INDEX[task], np.cumsum(length)
+            states = [np.vstack((file["obs"][end - n : end], file["obs2"][end - 1 : end]))
+                      for n, end in zip(length, ends, strict=True)]  # fmt: skip
+            tcp = [s[:, at["P_g"]] - s[:, at["e"]] for s in states]  # P_e = P_g - e
+            goal = [s[0, at["P_g"]] for s in states]
+            cube = [s[0, at["P_o"]] if "P_o" in at else np.full(3, np.nan, np.float32) for s in states]
+        else:
+            goal, cube = file["goal"], file["object"]
+            tcp = split(file["tcp"], length[: len(goal)])
+        paths = zip(tcp, goal, cube, file["success"], strict=False)
+        return task, [dict(zip(("tcp", "goal", "object", "success"), path, strict=True)) for path in paths]
+
+
+class Curves:
+    """One run: what its folder's files hold, each read when it is asked for. Raises BadInput that names the file."""
+
+    def __init__(self, folder):
+        self.folder, self.trajectories = folder, folder / "trajectories.npz"
+        with reading(folder / "config.json", "a run's flags as JSON"):
+            self.config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+            c = {"variant": "", "versions": {}} | self.config
+            self.pid = c["algo"] == "pid"
+            if self.pid:
+                c |= dict(recipe=c["gains"], symmetry="", num_demos=0, lambda_bc=0, seed=0, epochs=0, steps_per_epoch=0)
+            if c["task"] not in TASKS:
+                raise ValueError(f"task {c['task']}")
+            names = ("task", "algo", "recipe", "symmetry", "variant", "num_demos", "seed")
+            self.row = {name: c[name] for name in names} | {"lambda_bc": float(c["lambda_bc"])}
+            self.row["total_env_steps"] = int(c["epochs"] * c["steps_per_epoch"])
+            self.row["commit"] = str(c["versions"].get("git_commit", "unknown"))
+
+    @cached_property
+    def episodes(self):
+        return read_csv(self.folder / "episodes.csv", ("episode", "env_steps", "return", "length"))
+
+    @cached_property
+    def progress(self):
+        return read_csv(self.folder / "progress.csv", ("epoch", "env_steps", "seconds"))
+
+    @cached_property
+    def evaluations(self):
+        """{"" or what is not as in Sec. 5.2: its trials}."""
+        found = {}
+        for path in [*self.folder.glob("evaluation*.csv.gz"), *self.folder.glob("evaluation*.csv")]:
+            what = re.sub(r"^evaluation-?|\.csv(\.gz)?$", "", path.name)  # start_-0.8_0.5_0.4-horizon_600
+            what = ", ".join(part.replace("_", " ") for part in re.split("-(?=[a-z])", what))
+            found[what] = read_csv(path, ("trial", "success", "length", "return", "effort_percent", "e95_cm"))
+        return dict(sorted(found.items()))
+
+    @property
+    def success(self):
+        """P_scs of the test study in percent; NaN where there was none."""
+        return evaluate.metrics(self.evaluations[""])["P_scs_percent"] if "" in self.evaluations else math.nan
+
+    @cached_property
+    def validation(self):
+        """Success in percent on the trials while training, a Series by environment steps; empty where none."""
+        if self.pid or "eval_success" not in self.progress:
+            return pd.Series(dtype=float)
+        return 100 * self.progress.set_index("env_steps").eval_success.dropna()
+
+
+def find_runs(named=None):
+    """(DataFrame of the runs below the named folders, or of the default ones: one row a run, `curves` its Curves;
+    remarks to print). Of one configuration and seed there is one run: the finished, longest, own one."""
+    rows, remarks = {}, []
+    for folder in named or (RESULTS, *RUNS):
+        found = sorted(folder.resolve().rglob("config.json"))
+        if named and not found:
+            raise BadInput(f"--runs {folder}: no run there; a folder that holds config.json, or such folders, expected")
+        for path in found:
+            curves = Curves(path.parent)
+            if not curves.pid and not len(curves.episodes):
+                remarks.append(f"left out: {path.parent} has no episode yet")
+                continue
+            steps = int(curves.progress.env_steps.iloc[-1:].sum()) if not curves.pid else 0
+            rows[path] = curves.row | {"steps": steps, "finished": steps >= curves.row["total_env_steps"],
+                                       "own": not path.is_relative_to(RESULTS.resolve()), "curves": curves}  # fmt: skip
+    names = ["task", *GROUP, *COLUMN[1:], "seed", "commit", "steps", "finished", "own", "curves"]
+    runs = pd.DataFrame(rows.values(), columns=names).astype({"finished": bool, "own": bool})
+    runs = runs.sort_values(["finished", "steps", "own"], ascending=False, kind="stable")
+    for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
+        kept, *others = twins.itertuples()
+        copies = kept.commit, kept.steps, kept.curves.folder.name  # of a run and its published copy nothing is said
+        remarks += [f"left out: {other.curves.folder}; {kept.curves.folder} is of the same configuration and seed"
+                    for other in others if (other.commit, other.steps, other.curves.folder.name) != copies]  # fmt: skip
+        runs = runs.drop([other.Index for other in others])
+    remarks += [f"unfinished: {run.curves.folder}, {run.steps:,} of {run.total_env_steps:,} environment steps"
+                for run in runs[~runs.finished].itertuples()]  # fmt: skip
+    return runs.sort_values([*GROUP, *COLUMN[1:], "seed"], ignore_index=True), remarks
+
+
+def of_task(runs, task, variants=False):
+    """The runs of a task; of the recipes alone unless `variants`."""
+    return runs[(runs.task == task) & (variants | (runs.variant == ""))]
+
+
+def columns(task, runs=None):
+    """DataFrame of the paper's columns in printed order (sweep, algo, num_demos, lambda_bc and all metrics, NaN where
+    it has none), then of those that only these runs have.
+
+    The test tables' columns are the training tables' of the same sweep and value: P2P-O's lambda sweep (Table 7) prints
+    N_demos = 100, but its lambda = 1 then contradicts its own N_demos = 100."""
+    printed = []
+    for kind, metrics in METRICS.items():
+        table = read_csv(PAPER / f"{kind}_metrics.csv", list(metrics)[:1])
+        demos = table.num_demos.where(table.sweep == "demos", 0)
+        table["value"] = table.lambda_bc.where(table.sweep == "lambda", demos)
+        printed.append(table[table.task == task].drop(columns="task"))
+    training, test = printed
+    found = training.merge(test.drop(columns=COLUMN[1:]), on=["sweep", "value"], how="left")
+    found = pd.concat([found, test[test.sweep == "pid"].assign(algo="pid", num_demos=0, lambda_bc=0.0)])
+    if runs is not None:
+        ours = runs[COLUMN].drop_duplicates().merge(found[COLUMN].drop_duplicates(), how="left", indicator="where")
+        ours = ours[ours["where"] == "left_only"].drop(columns="where").sort_values(COLUMN)
+        found = pd.concat([found, ours.assign(sweep="other")])
+    return found.drop(columns="value").astype({"num_demos": int}).reset_index(drop=True)
+
+
+def of_column(runs, column):
+    """The runs of a column, which is a row of `columns`."""
+    return runs[(runs[COLUMN] == [column.algo, column.num_demos, column.lambda_bc]).all(axis=1)]
+
+
+def best_column(task):
+    """The printed column with the highest R90."""
+    found = columns(task)
+    return found.loc[found.R90.idxmax()]
+
+
+# ---- metrics ---------------------------------------------------------------------------------------------------------
+
+
+def running_mean(returns):
+    """(n,) -> (n,): mean of the last 50 returns, of fewer where there are not yet 50."""
+    return pd.Series(returns, dtype=float).rolling(WINDOW, min_periods=1).mean().to_numpy()
+
+
+def training_metrics(returns):
+    """The training metrics of one seed from its returns (n,), n >= 1; T50 in episodes from 1, NaN for N/A."""
+    tenth = math.ceil(len(returns) / 10)
+    R10, R90 = np.mean(returns[:tenth]), np.mean(returns[-tenth:])
+    reached = np.flatnonzero(running_mean(returns)[WINDOW - 1 :] > R90 / 2)  # full windows of 50 only
+    T50 = reached[0] + WINDOW if R90 > 0 and reached.size else math.nan
+    return {"R10": R10, "R90": R90, "I_R": R90 - R10, "T50": T50}
+
+
+def over_seeds(metric, values):
+    """evaluate.over_seeds, which does not know that a percentage lies in 0 ... 100."""
+    mean, *ends = evaluate.over_seeds(values)
+    return mean, *(np.clip(ends, 0, 100) if metric == "P_scs_percent" else ends)
+
+
+def measured(kind, runs):
+    """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies, the best in training."""
+    found = {}
+    for run in runs.itertuples():
+        if kind == "training" and not run.curves.pid:
+            found.setdefault("", []).append((run, training_metrics(run.curves.episodes["return"].to_numpy())))
+        for what, trials in run.curves.evaluations.items() if kind == "test" else ():
+            found.setdefault(what, []).append((run, evaluate.metrics(trials)))
+        if kind == "test" and len(run.curves.validation):
+            found.setdefault(BEST, []).append((run, {"P_scs_percent": run.curves.validation.max()}))
+    return dict(sorted(found.items(), key=lambda item: (item[0] == BEST, item[0])))
+
+
+def table(kind, task, runs):
+    """The table as DataFrame: a row for each column, group, evaluation and metric, in the paper's order; of a printed
+    column without runs, rows with 0 seeds."""
+    rows = []
+    for column in columns(task, runs).itertuples():
+        about, begun = {"task": task} | {name: getattr(column, name) for name in ("sweep", *COLUMN)}, len(rows)
+        for group, members in of_column(runs, column).groupby(GROUP):
+            for what, seeds in measured(kind, members).items():
+                of_group = about | dict(zip(GROUP, group, strict=True)) | {"evaluation": what, "seeds": len(seeds)}
+                of_group["unfinished"] = sum(not run.finished for run, _ in seeds)
+                of_group["commits"] = " ".join(sorted({run.commit[:7] for run, _ in seeds}))
+                for metric, digits in METRICS[kind].items():
+                    values = np.array([metrics.get(metric, math.nan) for _, metrics in seeds])
+                    (mean, low, high), method = over_seeds(metric, values), "over seeds"
+                    if kind == "test" and len(seeds) == 1 and what != BEST:
+                        trials = seeds[0][0].curves.evaluations[what]
+                        (low, high), method = evaluate.over_trials(trials)[metric], "over trials"
+                    paper = getattr(column, metric) if what == "" else math.nan
+                    rows.append(of_group | {
+                        "metric": metric, "paper": paper, "mean": mean, "low": low, "high": high,
+                        "interval": method if low == low else "", "na_seeds": int(np.isnan(values).sum()),
+                        # as printed, so that the mark agrees with what the reader sees
+                        "paper_outside": int(paper < round(low, digits) or paper > round(high, digits)),
+                        "values": values})  # fmt: skip
+        if len(rows) == begun and column.sweep != "other" and (column.sweep != "pid" or kind == "test"):
+            none = dict.fromkeys(GROUP[1:], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
+            rows += [about | none | {"metric": m, "paper": getattr(column, m)} for m in METRICS[kind]]
+    names = ["task", "sweep", *COLUMN[1:], *GROUP, "evaluation", "seeds", "unfinished", "metric", "paper", "mean",
+             "low", "high", "interval", "na_seeds", "paper_outside", "commits", "values"]  # fmt: skip
+    return pd.DataFrame(rows, columns=names)
+
+
+# ---- tables as text --------------------------------------------------------------------------------------------------
+
+
+def group_label(group):
+    *words, total = group
+    return " ".join(filter(None, [*words, f"{total / 1000:g}k steps" if total else ""]))
+
+
+def between(mean, low, high, digits):
+    """mean [low, high] as text, - where there is none."""
+    ends = f" [{low:.{digits}f}, {high:.{digits}f}]" if low == low else " [-]"
+    return f"{mean:.{digits}f}{ends}" if mean == mean else "-"
+
+
+def table_lines(kind, rows):
+    """`table` as lines of cells, all of one length, the heading first."""
+    digits, by = METRICS[kind], [*GROUP, "evaluation", "seeds", "unfinished"]
+    lines = [["sweep", "N_demos", "lambda_BC", "", *digits, "seeds"]]
+    for (sweep, _, N, lam), column in rows.groupby(["sweep", *COLUMN], sort=False):
+        paper = column[column.evaluation == ""].drop_duplicates("metric").set_index("metric").paper
+        printed = ["N/A" if x != x else f"{x:.{digits[m]}f}" for m, x in paper.items()]
+        key = [sweep, "", ""] if sweep == "pid" else [sweep, f"{N}", f"{lam:g}"]
+        lines.append([*key, "paper", *printed, ""] if paper.notna().any() else
+                     [*key, "not in the paper's table", *[""] * len(digits), ""])  # fmt: skip
+        for (*group, what, seeds, unfinished), cells in column.groupby(by, sort=False):
+            if not seeds:
+                lines.append(["", "", "", "no runs", *[""] * len(digits), ""])
+                continue
+            texts = []
+            for cell in cells.itertuples():
+                text = between(cell.mean, cell.low, cell.high, digits[cell.metric]) + " *" * int(cell.paper_outside)
+                if cell.metric == "T50" and cell.na_seeds:
+                    text = "N/A" if cell.na_seeds == seeds else f"{text} ({cell.na_seeds:.0f} N/A)"
+                texts.append(text)
+            lines.append(["", "", "", group_label(group) + f", {what}" * bool(what), *texts,
+                          f"{seeds}" + f" ({unfinished} unfinished)" * bool(unfinished)])  # fmt: skip
+    return lines
+
+
+def table_notes(kind, rows):
+    """What stands below the table, as lines."""
+    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t; * where the paper's lies outside it."]
+    if kind == "training":
+        notes += ["[-]: a single seed has none. T50 is by our rule (N/A where R90 <= 0); the paper's cannot be."]
+    else:
+        notes += ["A single seed: its interval over trials (P_scs: Wilson's), which knows nothing of other seeds.",
+                  f"The {BEST} is the best policy's on its trials there, not the last policy's."]  # fmt: skip
+    ours = rows[(rows.seeds > 0) & (rows.algo != "pid")]
+    for group, texts in ours.groupby(GROUP, sort=False).commits:
+        notes.append(f"Commits of {group_label(group)}: {', '.join(sorted(set(' '.join(texts).split())))}")
+    return [*notes, *undecided(kind, ours)]
+
+
+def undecided(kind, rows):
+    """Lines: the pairs of columns, of one sweep or with the baseline, that the paper ranks by the table's main metric
+    and whose difference in our seeds has an interval that contains 0."""
+    metric, lines, single = RANKED[kind], {}, set()
+    for _, group in rows[(rows.metric == metric) & (rows.evaluation == "")].groupby(GROUP):
+        for one, other in combinations(group.itertuples(), 2):
+            compared = one.sweep == other.sweep or "baseline" in (one.sweep, other.sweep)
+            if not (compared and abs(one.paper - other.paper) > 0):  # not where either is NaN
+                continue
+            gap, low, high = evaluate.difference(one.values, other.values)
+            pair = " and ".join(f"N_demos={row.num_demos} lambda_BC={row.lambda_bc:g}" for row in (one, other))
+            label = group_label([getattr(one, name) for name in GROUP])
+            if low != low:
+                single.add((label, pair))
+            elif low <= 0 <= high:
+                lines[f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
+                      f"{between(gap, low, high, METRICS[kind][metric])} ({label})"] = None  # fmt: skip
+    head = f"Pairs that the paper's {metric} ranks and our seeds cannot tell apart (Welch's 95 % interval contains 0):"
+    untold = [f"  {len(single)} pair(s) not compared: a single seed"] * bool(single)
+    return [head, *(lines or ["  none"]), *untold]
+
+
+def compared_lines(by, runs):
+    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: final test success by seed, its mean,
+    and Welch's difference from the recipe or from no symmetry."""
+    runs, order = runs[(runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))], ("", "none", "gas", "so2")
+    lines = [["group", "N_demos", "lambda_BC", by, "success in the test study, by seed (%)", "mean", "difference",
+              "90 % in training at steps"]]  # fmt: skip
+    for (*group, N, lam), members in runs.groupby([name for name in [*GROUP, *COLUMN[1:]] if name != by]):
+        found = {value: [run.curves for run in part.itertuples()] for value, part in members.groupby(by)}
+        if len(found) == 1 and (by == "symmetry" or "" in found):
+            continue
+        reference = [curves.success for curves in found.get("none" if by == "symmetry" else "", ())]
+        for value in sorted(found, key=lambda value: (order.index(value) if value in order else len(order), value)):
+            values = [curves.success for curves in found[value]]
+            reached = [curves.validation.index[curves.validation >= 90] for curves in found[value]]
+            gap = evaluate.difference(values, reference) if value not in ("", "none") else [math.nan] * 3
+            lines.append([group_label(group), f"{N}", f"{lam:g}", value or "the recipe's",
+                          " ".join("-" if x != x else f"{x:.1f}" for x in values),
+                          between(*over_seeds("P_scs_percent", values), 1), between(*gap, 1),
+                          " ".join(f"{steps[0]:,}" if len(steps) else "never" for steps in reached)])  # fmt: skip
+    return lines
+
+
+def make_table(kind, task, runs, variants=False):
+    """A task's table, kind one of METRICS, COMPARED, as (text, Markdown, DataFrame). variants: of METRICS, show runs
+    with flags other than their recipe's."""
+    if kind in METRICS:
+        rows = table(kind, task, of_task(runs, task, variants))
+        lines, notes, rows = table_lines(kind, rows), table_notes(kind, rows), rows.drop(columns="values")
+        title = f"{TITLES[task]}, {kind} metrics: {NUMBERS[kind][task]}, and ours"
+    else:
+        lines = compared_lines(COMPARED[kind], of_task(runs, task, variants=True))
+        notes = ["Mean over seeds, difference from the recipe or no symmetry; 95 % intervals by Student and Welch."]
+        notes, rows = notes + ["  no runs"] * (len(lines) == 1), pd.DataFrame(lines[1:], columns=lines[0])
+        title = f"{TITLES[task]}, {kind}"
+    text = "\n".join([title, "", aligned(lines), "", *notes])
+    return text, "\n".join([markdown(lines), "", *(f"{note}  " for note in notes)]), rows
+
+
+def aligned(lines):
+    widths = [max(map(len, texts)) for texts in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)
+
+
+def markdown(lines):
+    lines = [[cell.replace("|", r"\|").replace(" *", r" \*") for cell in line] for line in lines]
+    return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * len(lines[0]), *lines[1:]])
+
+
+# ---- the pages' tables -----------------------------------------------------------------------------------------------
+
+CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
+    "lambda": "A larger λ_BC is better",
+    "demos": "More demonstrations are better",
+    "plain": "Demo-EASE beats the plain algorithm",
+    "mask": "The mask matters",
+    "symmetry": "Symmetric demonstrations cost less",
+    "PID": "The agent beats its demonstrator",
+}
+
+
+def comparisons(task, runs):
+    """(claim, what is compared, one side, the other) that a task's runs allow; a side: list of Curves, or None."""
+    best, printed = best_column(task), columns(task)
+    pid = {run.recipe: [run.curves] for run in runs.itertuples() if run.algo == "pid"}
+    at = {group: {key: list(part.curves) for key, part in members.groupby(COLUMN[1:])}
+          for group, members in runs[runs.algo == best.algo].groupby(GROUP)}  # fmt: skip
+    key, ends = (best.num_demos, best.lambda_bc), {}
+    for sweep, value in (("lambda", "lambda_bc"), ("demos", "num_demos")):
+        rows = printed[printed.sweep == sweep].sort_values(value)
+        ends[sweep] = [(row.num_demos, row.lambda_bc) for row in (rows.iloc[-1], rows.iloc[0])]
+    for group, found in at.items():
+        (algo, recipe, symmetry, variant, total), label = group, group_label(group)
+        if variant.startswith("mask="):
+            sides = at.get((algo, recipe, symmetry, "", total), {}).get(key), found.get(key)
+            yield "mask", f"{label}: with it, and without", *(sides if variant == "mask=none" else sides[::-1])
+        if variant:
+            continue
+        for sweep, (high, low) in ends.items():
+            names = [f"{N} demonstrations, λ_BC = {lam:g}" for N, lam in (high, low)]
+            yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low)
+        yield "plain", f"{label}: with demonstrations, and without", found.get(key), found.get((0, 0.0))
+        for (N, lam), curves in found.items() if symmetry == "gas" else ():
+            real = N // curves[0].config["partitions"]
+            unmapped = at.get((algo, recipe, "none", "", total), {}).get((real, lam))
+            yield "symmetry", f"{label}: {real} demonstrations, mapped to {N} and as they are", curves, unmapped
+        gains = found[key][0].config["gains"] if key in found else None
+        yield "PID", f"{label}, and the PID with {gains} gains", found.get(key), pid.get(gains)
+
+
+def findings_lines(runs):
+    """Each claim of the paper, the difference in our test success (Welch's interval over seeds), and what it says."""
+    lines, said = [["the paper's claim", "task", "compared", "difference, points", "seeds", ""]], {}
+    found = ((task, *sides) for task in TASKS for sides in comparisons(task, runs[runs.task == task]))
+    for title, claim, compared, one, other in found:
+        if not (one and other):
+            continue
+        ours, theirs = ([curves.success for curves in side] for side in (one, other))
+        gap, low, high = evaluate.difference(ours, theirs)
+        if claim == "PID":  # one controller, whose success is taken as known
+            gap, low, high = evaluate.over_seeds(np.subtract(ours, theirs[0]))
+        verdict = "holds" if low > 0 else "does not hold" if high < 0 else "cannot be told apart"
+        seeds = f"{len(ours)}" if claim == "PID" else f"{len(ours)} and {len(theirs)}"
+        said.setdefault(claim, []).append([TITLES[title], compared, between(gap, low, high, 1), seeds,
+                                           f"*{verdict if low == low else 'too few seeds'}*"])  # fmt: skip
+    for claim, sentence in CLAIMS.items():
+        lines += [[sentence, *line] for line in said.get(claim, [["", "no runs", "", "", ""]])]
+    return lines
+
+
+def main_group(task, runs, recipe=None):
+    """The runs of the group (of this recipe) with most runs, of the paper's columns where it can be."""
+    runs = runs[(runs.task == task) & (runs.algo != "pid") & ((runs.recipe == recipe) | (recipe is None))]
+    printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
+    sizes = (printed if len(printed) else runs).groupby(GROUP).size().sort_values(kind="stable")
+    return runs[(runs[GROUP] == list(sizes.index[-1])).all(axis=1)] if len(sizes) else runs
+
+
+def results_lines(runs):
+    """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
+    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "command", "minutes"]]
+    for task in TASKS:
+        printed, best = columns(task), best_column(task)
+        (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
+        script, of_task = f"{best.algo}_demoease.py --task {task}", runs[(runs.task == task) & (runs.variant == "")]
+        agents = []
+        for recipe, name in (("robust", "robust"), ("paper", "as published")):
+            group = main_group(task, of_task[of_task.algo == best.algo], recipe)
+            agents += [(f"Demo-EASE, {name}", best, group, f"{script} --recipe {recipe}"),
+                       (f"{best.algo.upper()}, {name}", plain, group,
+                        f"{script} --recipe {recipe} --num_demos 0 --lambda_bc 0")]  # fmt: skip
+        agents += [(f"PID, {gains} gains", pid, of_task[of_task.recipe == gains],
+                    f"evaluate.py --pid --task {task} --gains {gains}") for gains in ("authors", "fast")]  # fmt: skip
+        for name, column, group, command in agents:
+            rows, part = table("test", task, of_column(group, column)), of_column(group, column)
+            found = rows[(rows.metric == "P_scs_percent") & (rows.evaluation == "") & (rows.seeds > 0)]
+            minutes = [run.progress.seconds.max() / 60 for run in part.curves if not run.pid]
+            for row in found.iloc[:1].to_dict("records"):
+                lines.append([TITLES[task], name, "-" if row["paper"] != row["paper"] else f"{row['paper']:g}",
+                              between(row["mean"], row["low"], row["high"], 1),
+                              f"{row['seeds']}" + " (unfinished)" * bool(row["unfinished"]), f"`{command}`",
+                              f"{np.median(minutes):.0f}" if minutes else "-"])  # fmt: skip
+    return lines
+
+
+def pid_lines(runs):
+    """The demonstrator in the test study and in other ones."""
+    lines = [["task", "", *METRICS["test"], "steps"]]
+    for run in runs[runs.algo == "pid"].sort_values(["task", "recipe"]).itertuples():
+        (printed,) = columns(run.task).query("sweep == 'pid'").to_dict("records")
+        if TITLES[run.task] not in [line[0] for line in lines]:
+            lines.append([TITLES[run.task], "paper", *(f"{printed[m]:g}" for m in METRICS["test"]), ""])
+        for what, trials in run.curves.evaluations.items():
+            metrics, ends = evaluate.metrics(trials), evaluate.over_trials(trials)
+            cells = [between(metrics[m], *ends[m], digits) for m, digits in {**METRICS["test"], "steps": 0}.items()]
+            lines.append([TITLES[run.task], f"{run.recipe} gains" + f", {what}" * bool(what), *cells])
+    return lines
+
+
+def gaps(task, runs):
+    """The commands that fill the gaps in a task's tables and figures, as lines to print."""
+    main, lines, names = main_group(task, runs), [], []
+    for column in columns(task).itertuples():
+        value = {"lambda": f"={column.lambda_bc:g}", "demos": f"={column.num_demos}"}.get(column.sweep, "")
+        if column.sweep != "pid" and not len(of_column(main, column)):
+            names.append(column.sweep + value)
+    if names:
+        recipe = main.recipe.iloc[0] if len(main) else "robust"
+        lines.append(f"python sweep.py --task {task} --recipe {recipe} --columns {' '.join(names)} --seeds 5 --jobs 2")
+    untested = [run.curves.folder for run in runs[runs.finished].itertuples() if "" not in run.curves.evaluations]
+    lines += [f"python evaluate.py {os.path.relpath(folder)} --trials 500 --jobs 2" for folder in untested]
+    lines += [f"python evaluate.py --pid --task {task} --gains {gains} --trials 500 --jobs 2 --out "
+              f"data/runs/pid-{task}-{gains}" for gains in ("authors", "fast")
+              if gains not in runs[runs.algo == "pid"].recipe.to_list()]  # fmt: skip
+    if not (RESULTS / f"demos-{task}.npz").exists():
+        lines += [f"python pid_demo.py --task {task} --record 40 --gains fast --out data/demos-{task}.npz",
+                  f"python plot_curves.py --publish data/demos-{task}.npz"]  # fmt: skip
+    return ["", f"{TITLES[task]}: to fill the gaps", *("    " + line for line in lines)] if lines else []
+
+
+BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
+          for kind in (*METRICS, *COMPARED) for task in TASKS}  # fmt: skip
+BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
+    ("results", results_lines), ("findings", findings_lines), ("demonstrator", pid_lines))}  # fmt: skip
