@@ -1,9 +1,8 @@
-"""Speed: environment steps a second, and a gradient update against the matrix products in it.
+"""Speed on one thread: environment steps a second, and milliseconds of one gradient update.
 
-    python tests/benchmark.py            # about a minute, on an otherwise idle machine
+    python tests/benchmark.py            # half a minute, on an otherwise idle machine
 
-The update's matrix products are recorded as they happen (shapes, strides, the tensors themselves) and run again alone;
-figures are the best of several rounds, products and updates taking turns.
+Each figure is the best of several rounds.
 """
 
 import sys
@@ -13,68 +12,56 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 import ddpg_demoease as ddpg  # noqa: E402
-from kinova_env import TASKS  # noqa: E402
+import ppo_demoease as ppo  # noqa: E402
+from kinova_env import OBS_DIM, TASKS  # noqa: E402
 
 
-class Products(TorchDispatchMode):
-    """Notes every matrix product that runs inside it, as a call that can be made again."""
-
-    def __init__(self):
-        super().__init__()
-        self.calls = []
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        if function.overloadpacket in (torch.ops.aten.addmm, torch.ops.aten.mm):
-            left, right = args[-2:]
-            self.calls.append((left.detach(), right.detach(), torch.empty(left.shape[0], right.shape[1])))
-        return function(*args, **(kwargs or {}))
+def seconds(work, rounds=5):
+    """The shortest of several rounds."""
+    found = []
+    for _ in range(rounds):
+        begin = time.perf_counter()
+        work()
+        found.append(time.perf_counter() - begin)
+    return min(found)
 
 
-def environment(task, steps=5000, rounds=8):
-    """Steps a second through gymnasium.make with random actions, resets included."""
+def environment(task, steps=3000):
+    """Steps a second of random actions, resets included."""
     env = gymnasium.make(TASKS[task].env_id, disable_env_checker=True)
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, 4)).astype(np.float32)
-    best = 0.0
-    for _ in range(rounds):
+
+    def work():
         env.reset(seed=0)
-        begin = time.perf_counter()
         for a in actions:
             _, _, terminated, truncated, _ = env.step(a)
             if terminated or truncated:
                 env.reset()
-        best = max(best, steps / (time.perf_counter() - begin))
-    return best
+
+    work()
+    return steps / seconds(work)
 
 
-def update(task, recipe, rounds=15):
-    """(seconds of one update in its block, seconds of its matrix products alone, their number, their FLOP)."""
-    flags, _ = ddpg.complete(ddpg.Flags(task=task, recipe=recipe))
-    width = sum(w for _, w, _ in ddpg.evaluate.OBSERVATION[task])
-    learner, buffer = ddpg.Learner(flags, width), ddpg.ReplayBuffer(width, 20_000)
-    buffer.rows.normal_(0, 0.3)
-    buffer.rows[:, -1] = 0
-    buffer.filled = len(buffer.rows)
-    learner.block(buffer, buffer, flags.update_every)
-    with Products() as products:
-        learner.update(buffer.sample(100, 1)[0], buffer.sample(100, 1)[0])
-    whole = alone = float("inf")
-    with torch.inference_mode():
-        flop = sum(2 * a.shape[0] * a.shape[1] * b.shape[1] for a, b, _ in products.calls)
-    for _ in range(rounds):
-        begin = time.perf_counter()
-        learner.block(buffer, buffer, flags.update_every)
-        whole = min(whole, (time.perf_counter() - begin) / flags.update_every)
-        begin = time.perf_counter()
-        with torch.inference_mode():
-            for _ in range(flags.update_every):
-                for a, b, out in products.calls:
-                    torch.mm(a, b, out=out)
-        alone = min(alone, (time.perf_counter() - begin) / flags.update_every)
-    return whole, alone, len(products.calls), flop
+def ddpg_update(task, recipe, updates=20):
+    f = ddpg.resolve(ddpg.Flags(task=task, recipe=recipe))
+    learner, B = ddpg.Learner(f), ddpg.ReplayBuffer(OBS_DIM[task], 20_000, f.symmetry)
+    B.load({"rows": torch.randn(B.rows.shape), "next": 0})
+    learner.updates(B, B, updates)
+    return seconds(lambda: learner.updates(B, B, updates)) / updates
+
+
+def ppo_update(task, recipe):
+    """With all of an epoch's updates, whatever the KL; its sums over the trajectories are part of it."""
+    f = ppo.resolve(ppo.Flags(task=task, recipe=recipe, target_kl=1e9))
+    learner, B = ppo.Learner(f), ppo.TrajectoryBuffer(OBS_DIM[task], f.steps_per_epoch, f.symmetry)
+    rows = torch.randn(B.rows.shape)
+    rows[:, -3:] = torch.tensor([0.0, 1.0, 1.0])  # zeta, end, own
+    B.extend(rows)
+    learner.updates(B, B, torch.zeros(len(rows)))
+    return seconds(lambda: learner.updates(B, B, torch.zeros(len(rows)))) / f.train_iters
 
 
 if __name__ == "__main__":
@@ -82,10 +69,7 @@ if __name__ == "__main__":
     torch.set_flush_denormal(True)
     for task in TASKS:
         print(f"environment {task:5s} {environment(task):8.0f} steps/s")
-    for task in ("p2p", "p2po"):
-        for recipe in ("paper", "robust"):
-            whole, alone, calls, flop = update(task, recipe)
-            print(
-                f"update {task:5s} {recipe:7s} {1e3 * whole:6.2f} ms; its {calls} matrix products alone "
-                f"{1e3 * alone:6.2f} ms ({flop / alone / 1e9:.0f} GFLOP/s): {whole / alone:.2f} times"
-            )
+    for name, update, tasks in (("ddpg", ddpg_update, ("p2p", "p2po")), ("ppo", ppo_update, ("pnp",))):
+        for task in tasks:
+            for recipe in ("paper", "robust"):
+                print(f"{name:4s} update {task:5s} {recipe:7s} {1e3 * update(task, recipe):6.2f} ms")
