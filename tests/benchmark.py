@@ -1,6 +1,6 @@
 """Speed on one thread: environment steps a second, and milliseconds of one gradient update.
 
-    python tests/benchmark.py            # half a minute, on an otherwise idle machine
+    python tests/benchmark.py            # about a minute, on an otherwise idle machine
 
 Each figure is the best of several rounds.
 """
