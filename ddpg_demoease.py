@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
+from tqdm import trange
 
 import evaluate
 import gas
@@ -352,7 +353,7 @@ class Learner:
             for x in (net, self.target):
                 x.s_mean.copy_(s.mean(0))
                 x.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
-        for _ in range(f.clone_iters):
+        for _ in trange(f.clone_iters, desc="actor cloning", disable=f.quiet or None):
             s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a_demo, net.pi(s_demo), torch.ones_like(a_demo[:, 0]))
             self.optimizer.zero_grad()
@@ -360,7 +361,7 @@ class Learner:
             self.optimizer.step()
         self.target.load_state_dict(net.state_dict())
         self.actor.load_state_dict(net.state_dict())
-        for _ in range(f.clone_iters):
+        for _ in trange(f.clone_iters, desc="critic following", disable=f.quiet or None):
             self.update(B_o, B_d, hold_actor=True)
 
     def state(self):

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
+from tqdm import trange
 
 import evaluate
 import gas
@@ -289,7 +290,7 @@ class Learner:
             net.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
         optimizer = self.adam(f.vf_lr, f.vf_lr)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
-        for _ in range(f.clone_iters):
+        for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
             s, a, _, R = self.demo_batch(B_d, R_demo)
             loss = loss_BC(a, net.mu(s), torch.ones_like(R)) + loss_C(net.V(s), R)
             optimizer.zero_grad()
