@@ -301,9 +301,8 @@ class KinovaEnv(gymnasium.Env):
         pybullet.resetSimulation(**id_)
         pybullet.setGravity(0, 0, -9.81, **id_)
         # With this slop the solver never pushes touching links apart: contacts are read, not felt, and stay symmetric.
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, contactSlop=1.0, **id_
-        )
+        settings = dict(fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, contactSlop=1.0)
+        pybullet.setPhysicsEngineParameter(**settings, **id_)
         flags = (
             pybullet.URDF_USE_INERTIA_FROM_FILE
             | pybullet.URDF_USE_IMPLICIT_CYLINDER
@@ -319,22 +318,17 @@ class KinovaEnv(gymnasium.Env):
         pybullet.setCollisionFilterPair(self._robot, self._robot, 4, 6, 0, **id_)
         self._cube = self._goal_marker = None
         if self.row.cube:
-            half = [CUBE_SIZE / 2] * 3
-            shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **id_)
-            visual = pybullet.createVisualShape(
-                pybullet.GEOM_BOX, halfExtents=half, rgbaColor=[0.84, 0.37, 0.0, 1], **id_
-            )
+            box = dict(shapeType=pybullet.GEOM_BOX, halfExtents=[CUBE_SIZE / 2] * 3)
+            shape = pybullet.createCollisionShape(**box, **id_)
+            visual = pybullet.createVisualShape(**box, rgbaColor=[0.84, 0.37, 0.0, 1], **id_)
             self._cube = pybullet.createMultiBody(0, shape, visual, [0, 0, -1], **id_)
             # The cube never pushes: an episode ends on contact (P2P-O), or the cube has no response at all (P&P).
             pybullet.setCollisionFilterGroupMask(self._cube, -1, 0, 0, **id_)
         if self.render_mode:
-            disc = pybullet.createVisualShape(
-                pybullet.GEOM_CYLINDER, radius=0.9, length=0.01, rgbaColor=[0.80, 0.82, 0.84, 1], **id_
-            )
-            pybullet.createMultiBody(0, -1, disc, [0, 0, -0.006], **id_)
-            ball = pybullet.createVisualShape(
-                pybullet.GEOM_SPHERE, radius=EPSILON, rgbaColor=[0.0, 0.62, 0.45, 0.6], **id_
-            )
+            disc = dict(shapeType=pybullet.GEOM_CYLINDER, radius=0.9, length=0.01, rgbaColor=[0.80, 0.82, 0.84, 1])
+            pybullet.createMultiBody(0, -1, pybullet.createVisualShape(**disc, **id_), [0, 0, -0.006], **id_)
+            ball = dict(shapeType=pybullet.GEOM_SPHERE, radius=EPSILON, rgbaColor=[0.0, 0.62, 0.45, 0.6])
+            ball = pybullet.createVisualShape(**ball, **id_)
             self._goal_marker = pybullet.createMultiBody(0, -1, ball, [0, 0, -1], **id_)
         self._touched = False
 
@@ -429,14 +423,10 @@ class KinovaEnv(gymnasium.Env):
                 break
         else:
             if self.stage == "demo" and set(options) <= {"partition"}:
-                raise ValueError(
-                    f"partitions {self.partitions}: too many, no {self.task} demonstration fits in a sector"
-                )
+                raise ValueError(f"partitions {self.partitions}: too many, no {self.task} demonstration fits a sector")
         self.goal = cartesian(*goal).tolist()
         if self._goal_marker is not None:
-            pybullet.resetBasePositionAndOrientation(
-                self._goal_marker, self.goal, [0, 0, 0, 1], physicsClientId=self._client
-            )
+            pybullet.resetBasePositionAndOrientation(self._goal_marker, self.goal, [0, 0, 0, 1], self._client)
         if self.render_mode == "human":
             self._show()
         e = [g - p for g, p in zip(self.goal, self.tcp, strict=True)]
@@ -456,33 +446,18 @@ class KinovaEnv(gymnasium.Env):
             self._move_cube(cube[0])
 
     def _move_cube(self, yaw):
-        pybullet.resetBasePositionAndOrientation(
-            self._cube,
-            self.cube,
-            [0, 0, math.sin(yaw / 2), math.cos(yaw / 2)],
-            physicsClientId=self._client,
-        )
+        turned = [0, 0, math.sin(yaw / 2), math.cos(yaw / 2)]
+        pybullet.resetBasePositionAndOrientation(self._cube, self.cube, turned, self._client)
 
     def step(self, action):
         """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it has a NaN."""
-        a1, a2, a3, a5 = action.tolist() if isinstance(action, np.ndarray) else action
-        if a1 != a1 or a2 != a2 or a3 != a3 or a5 != a5:
+        action = action.tolist() if isinstance(action, np.ndarray) else action
+        if any(a != a for a in action):
             raise ValueError(f"action {action!r}: has a NaN")
-        v1, v2, v3, v5 = self._velocity_scale
+        velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
         client = self._client
-        pybullet.setJointMotorControlArray(
-            self._robot,
-            ACTIVE_JOINTS,
-            pybullet.VELOCITY_CONTROL,
-            targetVelocities=(
-                v1 * max(-1.0, min(1.0, a1)),
-                v2 * max(-1.0, min(1.0, a2)),
-                v3 * max(-1.0, min(1.0, a3)),
-                v5 * max(-1.0, min(1.0, a5)),
-            ),
-            forces=TAU_MAX,
-            physicsClientId=client,
-        )
+        pybullet.setJointMotorControlArray(self._robot, ACTIVE_JOINTS, pybullet.VELOCITY_CONTROL, forces=TAU_MAX,
+                                           targetVelocities=velocities, physicsClientId=client)  # fmt: skip
         pybullet.stepSimulation(physicsClientId=client)
         j1, j2, j3, j5 = pybullet.getJointStates(self._robot, ACTIVE_JOINTS, physicsClientId=client)
         self.q, self.q_dot = (j1[0], j2[0], j3[0], j5[0]), (j1[1], j2[1], j3[1], j5[1])
@@ -506,20 +481,8 @@ class KinovaEnv(gymnasium.Env):
         # Eq. 11
         r_dst, r_eft = -ALPHA_1 * to_go, -ALPHA_2 * tau_hat
         r_rch, r_cls, r_grsp = R_1 * success, -R_2 * bool(collision), R_3 * first_grasp
-        info = {
-            "is_success": success,
-            "collision": collision,
-            "grasped": self.grasped,
-            "distance": distance,
-            "effort": tau_hat,
-            "reward_terms": {
-                "distance": r_dst,
-                "effort": r_eft,
-                "reaching": r_rch,
-                "collision": r_cls,
-                "grasping": r_grsp,
-            },
-        }
+        info = dict(is_success=success, collision=collision, grasped=self.grasped, distance=distance, effort=tau_hat)
+        info["reward_terms"] = dict(distance=r_dst, effort=r_eft, reaching=r_rch, collision=r_cls, grasping=r_grsp)
         truncated = False
         if self.stage == "demo":
             outside = abs(wrap(math.atan2(y, x) - self.sector_start(self.partition)))
@@ -527,13 +490,8 @@ class KinovaEnv(gymnasium.Env):
             info["partition"] = self.partition
         if self.render_mode == "human":
             self._show()
-        return (
-            self._observe(e),
-            r_dst + r_eft + r_rch + r_cls + r_grsp,
-            success or collision != "",
-            truncated,
-            info,
-        )
+        r = r_dst + r_eft + r_rch + r_cls + r_grsp
+        return self._observe(e), r, success or collision != "", truncated, info
 
     def _observe(self, e):
         q1, q2, q3, q5 = self.q
@@ -585,16 +543,8 @@ class KinovaEnv(gymnasium.Env):
         id_ = {"physicsClientId": self._client}
         view = pybullet.computeViewMatrixFromYawPitchRoll([0, 0, 0.36], 1.75, 38, -22, 0, 2)
         lens = pybullet.computeProjectionMatrixFOV(42, self.width / self.height, 0.1, 5)
-        *_, rgba, _, _ = pybullet.getCameraImage(
-            self.width,
-            self.height,
-            view,
-            lens,
-            lightDirection=[0.6, -0.8, 1.6],
-            shadow=1,
-            renderer=pybullet.ER_TINY_RENDERER,
-            **id_,
-        )
+        look = dict(lightDirection=[0.6, -0.8, 1.6], shadow=1, renderer=pybullet.ER_TINY_RENDERER)
+        *_, rgba, _, _ = pybullet.getCameraImage(self.width, self.height, view, lens, **look, **id_)
         return np.asarray(rgba, dtype=np.uint8).reshape(self.height, self.width, 4)[..., :3]
 
     def close(self):
