@@ -456,7 +456,7 @@ def loop(f, run):
                 learner.decay_learning_rates(remaining=1 - t / run.total_steps)
             n = math.floor(f.updates_per_step * t) - math.floor(f.updates_per_step * (t - f.update_every))
             if n:
-                run.log_updates(learner.updates(B_o, B_d, n))
+                run.log_updates(learner.updates(B_o, B_d, n), learner.net)
 
         # log
         if t % f.steps_per_epoch == 0:

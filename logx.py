@@ -535,12 +535,12 @@ class RunFolder:
         self._log["epoch_episodes"].append([episode["r"], episode["l"], int(info["is_success"])])
         self._bar.update(env_steps - self._bar.n)
 
-    def log_updates(self, measured):
-        """Floats by name (NaN: not measured) of some updates; the epoch's line has their mean. Raises NotFinite where
-        a loss is not finite."""
-        if not math.isfinite(measured["L_C"]) or math.isinf(measured["L_A"]):
-            raise NotFinite(f"{self.folder}: L_C is {measured['L_C']}, L_A {measured['L_A']}; go on from its last "
-                            "checkpoint with --resume, or begin anew with smaller learning rates")  # fmt: skip
+    def log_updates(self, measured, net):
+        """Floats by name (NaN: not measured) of some updates of net; the epoch's line has their mean. Raises NotFinite
+        where a weight is not finite: nothing may act with it, or overwrite a checkpoint."""
+        if not all(w.isfinite().all() for w in net.parameters()):
+            raise NotFinite(f"{self.folder}: a weight is NaN or infinite; go on from its last checkpoint with "
+                            "--resume, or begin anew with smaller learning rates")  # fmt: skip
         self._log["epoch_updates"].append(measured)
 
     def log_epoch(self, env_steps, evaluate):
@@ -595,5 +595,5 @@ class RunFolder:
                 sizes[table] = os.fstat(file.fileno()).st_size
             state = state | {"log_bytes": sizes, "log": json.dumps(self._log), "seconds": self.seconds(),
                              "config": json.dumps(self._config, default=str), "format": FORMAT}  # fmt: skip
-            atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))
             atomic_write(self.folder / "policy.pt", lambda file: torch.save(policy, file))
+            atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))  # last

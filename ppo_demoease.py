@@ -388,6 +388,9 @@ def train(flags):
 
 def loop(f, run):
     demos, demo_env_steps = (None, 0) if run.checkpoint else pid_demo.demonstrations(f)
+    if f.demos_in_B_o and demos and "executed" in demos:
+        raise logx.BadInput(f"--demos {f.demos}: recorded with noise, so that B_o would not hold what was done; use "
+                            "--no-demos_in_B_o")  # fmt: skip
     torch.manual_seed(f.seed)
     rng = np.random.default_rng(f.seed)  # of exploration
     env = gymnasium.make(TASKS[f.task].env_id, stage="train", max_episode_steps=f.max_ep_len, disable_env_checker=True)
@@ -448,7 +451,7 @@ def loop(f, run):
         # update, log
         if cut:
             if measured := learner.updates(B_o, B_d, R_demo):
-                run.log_updates(measured)
+                run.log_updates(measured, learner.net)
             B_o.filled = 0
             shown = open_epoch(shown)
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))

@@ -266,7 +266,8 @@ def test_epochs_cut_no_episode(script, world):
 
 def test_a_row_of_progress_averages_its_own_epoch(script, world, monkeypatch):
     logged, log_updates, log_epoch = [[]], logx.RunFolder.log_updates, logx.RunFolder.log_epoch
-    monkeypatch.setattr(logx.RunFolder, "log_updates", lambda self, m: logged[-1].append(m) or log_updates(self, m))
+    monkeypatch.setattr(logx.RunFolder, "log_updates", lambda self, m, net: logged[-1].append(m)
+                        or log_updates(self, m, net))  # fmt: skip
     monkeypatch.setattr(logx.RunFolder, "log_epoch", lambda *args: log_epoch(*args) or logged.append([]))
     run = world("a", steps_per_epoch=20, epochs=6, num_demos=4, lambda_bc=1.0, recorded=demo_arrays())
     episodes, progress = rows_of(run.folder / "episodes.csv"), rows_of(run.folder / "progress.csv")
@@ -286,20 +287,38 @@ def test_a_row_of_progress_averages_its_own_epoch(script, world, monkeypatch):
 # ---- how a run ends --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("loss", ["loss_C"])
-def test_nan_ends_a_run_and_the_last_checkpoint_is_kept(script, loss, tmp_path, monkeypatch):
-    """Some updates after the first checkpoint (step 40; off-policy learning begins at 63) it breaks down."""
+@pytest.mark.parametrize("good", [4, 5, 7])
+@pytest.mark.parametrize("loss", ["loss_C", "loss_O"])
+def test_nan_ends_a_run_and_the_last_checkpoint_is_kept(script, loss, good, tmp_path, monkeypatch):
+    """The first checkpoint is at step 40. After so many good updates it breaks down: on-policy in the first, second
+    or last update of the next epoch; off-policy in the block of 8 at step 80, where the last is its end too."""
     real, calls = getattr(script, loss), []
 
     def breaks_down(*args):
         calls.append(0)
-        return real(*args) * (math.nan if len(calls) > 4 else 1)
+        return real(*args) * (math.nan if len(calls) > good else 1)
 
     monkeypatch.setattr(script, loss, breaks_down)
-    run = scripted_run(script, tmp_path, "a")
+    run = scripted_run(script, tmp_path, "a", **{} if script is ppo else dict(update_every=8, update_after=80))
     assert isinstance(run.error, logx.NotFinite)  # exit code 3
     saved = checkpoint(run.folder)
     assert saved["t"] == 40 and all(w.isfinite().all() for w in saved["learner"]["net"].values())
+
+
+@pytest.mark.parametrize("file", [1, 2, 3, 7], ids=["config", "policy", "checkpoint", "last checkpoint"])
+def test_a_run_that_ends_before_a_file_is_in_place_resumes_as_if_it_had_never_stopped(script, file, world, tmp_path):
+    whole, written, write = world("whole"), [], logx.atomic_write
+
+    def ends(path, content):
+        written.append(path)
+        if len(written) == file:
+            raise KeyboardInterrupt
+        write(path, content)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logx, "atomic_write", ends)
+        assert isinstance(scripted_run(script, tmp_path, "a").error, KeyboardInterrupt)
+    assert curves(world("a", resume=True).folder) == curves(whole.folder)
 
 
 def test_train_works_in_a_thread_and_raises_value_error_on_bad_input(script, world, tmp_path):

@@ -67,10 +67,10 @@ def stopped(tmp_path):
         run.begin(demo_env_steps=7)
         for t in (20, 50):
             log_episode(run, t)
-        run.log_epoch(50, {})
+        run.log_epoch(50, dict)
         run.save({"t": 50, "tensor": torch.arange(3)}, {"weights": {}})
         log_episode(run, 90)
-        run.log_epoch(100, {})
+        run.log_epoch(100, dict)
     return tmp_path / "a"
 
 
@@ -353,14 +353,14 @@ def test_a_new_run_has_its_flags_its_command_and_curves_with_the_columns_of_its_
 
 
 def test_an_epochs_row_is_the_mean_of_its_episodes_and_updates_and_blank_where_nothing_was_measured(tmp_path):
-    with folder_of(tmp_path / "a") as run:
+    with folder_of(tmp_path / "a", eval_every=1) as run:
         run.begin(demo_env_steps=300)
         log_episode(run, 30, success=True)
         log_episode(run, 45)
-        run.log_updates({"L_C": 1.0, "L_A": math.nan})
-        run.log_updates({"L_C": 2.0, "L_A": math.nan})
-        run.log_epoch(50, {"eval_success": 0.5, "eval_return": -1.25})
-        run.log_epoch(100, {})
+        for L_C in (1.0, 2.0):
+            run.log_updates({"L_C": L_C, "L_A": math.nan}, torch.nn.Linear(1, 1))
+        run.log_epoch(50, lambda: {"eval_success": 0.5, "eval_return": -1.25})
+        run.log_epoch(100, dict)
     episodes = (run.folder / "episodes.csv").read_text().splitlines()
     assert episodes[1:] == ["1,30,-10,30,1,", "2,45,-15,45,0,self"]
     first, second = (line.split(",") for line in (run.folder / "progress.csv").read_text().splitlines()[1:])
@@ -368,11 +368,13 @@ def test_an_epochs_row_is_the_mean_of_its_episodes_and_updates_and_blank_where_n
     assert second[:3] + second[4:] == ["2", "100", "300"] + [""] * 7  # the next epoch begins with nothing
 
 
-@pytest.mark.parametrize("measured", [{"L_C": math.nan, "L_A": 0.0}, {"L_C": 0.0, "L_A": math.inf}])
-def test_a_loss_that_is_not_finite_ends_the_run_and_says_how_to_go_on(tmp_path, measured):
+@pytest.mark.parametrize("weight", [math.nan, math.inf])
+def test_a_weight_that_is_not_finite_ends_the_run_and_says_how_to_go_on(tmp_path, weight):
+    net = torch.nn.Linear(1, 1)
+    torch.nn.init.constant_(net.weight, weight)
     with folder_of(tmp_path / "a") as run, pytest.raises(logx.NotFinite, match="--resume"):
         run.begin()
-        run.log_updates(measured)
+        run.log_updates({"L_C": 0.0, "L_A": 0.0}, net)
 
 
 def test_the_table_is_said_unless_quiet_and_standard_error_is_silent_where_it_is_no_terminal(tmp_path, capsys):
@@ -380,7 +382,7 @@ def test_the_table_is_said_unless_quiet_and_standard_error_is_silent_where_it_is
         with folder_of(tmp_path / str(quiet), quiet=quiet) as run:
             run.begin(demo_env_steps=1234)
             log_episode(run, 50, success=True)
-            run.log_epoch(50, {})
+            run.log_epoch(50, dict)
         out, err = capsys.readouterr()
         assert err == "" and bool(out) is not quiet
     title, heads, row = out.splitlines()
@@ -399,7 +401,7 @@ def test_a_resume_cuts_the_curves_back_to_the_checkpoint_and_goes_on_from_there(
         assert first_column(stopped / "episodes.csv") == ["episode", "1", "2"]
         assert first_column(stopped / "progress.csv") == ["epoch", "1"]
         log_episode(run, 60)
-        run.log_epoch(100, {})
+        run.log_epoch(100, dict)
     assert (stopped / "episodes.csv").read_text().splitlines()[-1] == "3,60,-20,60,0,self"
     assert (stopped / "progress.csv").read_text().splitlines()[-1].startswith("2,100,7,")  # its demonstrations too
 

@@ -590,7 +590,8 @@ def test_demonstrations_an_epoch_are_a_fifth_of_those_asked_for_rounded_up_and_a
 @pytest.mark.parametrize("flags, says", [
     (dict(grasp_input=True), "--grasp_input: --task p2p has nothing to grasp; allowed on --task pnp"),
     (dict(demo_noise=0.1, demos_in_B_o=True), "--demos_in_B_o"),
-], ids=["the cube's input without a cube", "noisy demonstrations in B_o"])  # fmt: skip
+    (dict(num_demos=4, recorded=demo_arrays() | dict(executed=None)), "--no-demos_in_B_o"),
+], ids=["the cube's input without a cube", "noisy demonstrations in B_o", "a file of them in B_o"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ppo, tmp_path, "a", **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()
