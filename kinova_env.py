@@ -76,7 +76,7 @@ BOUND = {"q": math.pi, "sin q": 1.0, "cos q": 1.0, "q_dot": 20.0, "P_g": 2.0, "e
 # Where goals are drawn, radius and height in m (Eq. 10): on train and test, and on demo.
 RHO, Z = (0.3, 0.7), (0.25, 0.65)
 RHO_DEMO, Z_DEMO = (0.4, 0.6), (0.35, 0.55)
-CUBE_DRAWS = 200  # of a P&P cube for one goal
+CUBE_DRAWS = 50  # of a P&P cube for one goal
 
 # Reward, Eq. 11, and the grasp rule.
 ALPHA_1, ALPHA_2 = 2e-3, 1e-3
@@ -255,7 +255,7 @@ class KinovaEnv(gymnasium.Env):
     The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. On stage "demo" the
     goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube that cannot
     be grasped, or lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in
-    collision or at the goal is drawn again whole. So is a P&P goal for which 200 cubes will not do: 0 of 20,000 goals
+    collision or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: 0 of 20,000 goals
     on each stage (of the lowest goals' cubes 60 % can be grasped), some where sectors are narrow (K > 10).
 
     ## Episode end
