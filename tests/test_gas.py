@@ -7,13 +7,12 @@ import pytest
 import torch
 
 import gas
-from kinova_env import OBSERVATION, TASKS, KinovaEnv, tcp, wrap
+from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, KinovaEnv, tcp, wrap
 from pid_demo import PID, record
 
 PI = math.pi
-WIDTH = {task: sum(width for _, width, _ in layout) for task, layout in OBSERVATION.items()}
 CUBES = [task for task in TASKS if TASKS[task].cube]
-ANGLES = [PI / 2, PI, -PI / 2, *np.random.default_rng(0).uniform(-PI, PI, 2).tolist()]
+ANGLES = [PI / 2, PI, 1.234, -2.5]
 ROWS = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")
 
 
@@ -99,8 +98,7 @@ def test_phi_of_a_simulated_episode_is_the_simulated_rotated_episode(name):
             assert difference(gas.phi(obs, k), obs_) < 1e-6
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("K", [3, 4])
+@pytest.mark.parametrize("task, K", [("p2p", 4), ("p2po", 3), ("pnp", 4)])
 def test_phi_of_a_demonstration_is_the_demonstration_in_the_other_partition_and_ends_with_it(task, K):
     """The TCP leaves its sector at the same step as its image leaves the sector k places further round."""
     centre = -PI / K if task == "p2p" else 0.0
@@ -122,14 +120,11 @@ def test_phi_of_a_demonstration_is_the_demonstration_in_the_other_partition_and_
 
 @pytest.mark.parametrize("task", TASKS)
 def test_what_rotates_is_what_the_observation_layout_says(task):
-    obs = states(WIDTH[task])
+    obs = states(OBS_DIM[task])
     angle = 0.7
     out = gas.rotate(obs, angle)
-    begin, seen = 0, set()
-    for name, width, rotates in OBSERVATION[task]:
-        old, new = obs[:, begin : begin + width], out[:, begin : begin + width]
-        begin += width
-        seen.add(rotates)
+    for name, _, rotates in OBSERVATION[task]:
+        old, new = obs[:, INDEX[task][name]], out[:, INDEX[task][name]]
         if rotates == "":
             expected = old
         elif rotates == "vector":
@@ -140,25 +135,19 @@ def test_what_rotates_is_what_the_observation_layout_says(task):
             first["cosine"] = np.cos(obs[:, 0] - angle)
             expected = np.column_stack([first[rotates], old[:, 1:]])
         np.testing.assert_allclose(new, expected, rtol=0, atol=1e-12, err_msg=name)
-    assert seen == {"angle", "sine", "cosine", "", "vector"}
+    assert {rotates for *_, rotates in OBSERVATION[task]} == {"angle", "sine", "cosine", "", "vector"}
 
 
-def test_width_is_what_decides_and_any_other_is_a_value_error():
-    for width in (21, 23, 24, 26, 4):
-        obs = np.zeros((3, width))
-        for wrong in (obs, torch.from_numpy(obs)):
-            for use in (
-                lambda o: gas.rotate(o, 0.1), lambda o: gas.phi(o, 0), lambda o: gas.phi(o, 1), gas.canonical,
-                gas.partition_of,
-            ):  # fmt: skip
-                with pytest.raises(ValueError, match=f"width {width}"):
-                    use(wrong)
+@pytest.mark.parametrize("use", [lambda obs: gas.phi(obs, 0), gas.canonical, gas.partition_of])
+def test_width_is_what_decides_and_any_other_is_a_value_error(use):
+    for wrong in (np.zeros((3, 24)), torch.zeros(3, 4)):
+        with pytest.raises(ValueError, match=f"width {wrong.shape[-1]}"):
+            use(wrong)
 
 
-@pytest.mark.parametrize("width", [22, 25])
-@pytest.mark.parametrize("K", [1, 2, 3, 4, 5, 8])
-def test_phi_of_phi_is_phi_of_the_sum_modulo_K(width, K):
-    obs = states(width)
+@pytest.mark.parametrize("K", [1, 3, 4])
+def test_phi_of_phi_is_phi_of_the_sum_modulo_K(K):
+    obs = states(25)
     for a in range(K):
         for b in range(K):
             assert difference(gas.phi(gas.phi(obs, b, K), a, K), gas.phi(obs, (a + b) % K, K)) < 1e-12
@@ -174,9 +163,8 @@ def test_phi_moves_every_state_and_four_partitions_are_the_default():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("width", [22, 25])
-def test_phi_0_returns_a_copy_that_is_the_same_bit_for_bit(width, dtype):
-    obs = states(width, dtype=dtype)
+def test_phi_0_returns_a_copy_that_is_the_same_bit_for_bit(dtype):
+    obs = states(22, dtype=dtype)
     obs[0, 0], obs[1, 16], obs[2, 0] = 17.0, -0.0, PI  # not even wrapped
     for k in (0, 4, -4):
         same = gas.phi(obs, k)
@@ -202,9 +190,9 @@ MAPS = {
 
 
 @pytest.mark.parametrize("name", MAPS)
-@pytest.mark.parametrize("shape", [(), (1,), (6,), (2, 3), (2, 0, 3)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("width", [22, 25])
+@pytest.mark.parametrize("width, dtype, shape", [
+    (22, np.float32, ()), (22, np.float64, (2, 0, 3)), (25, np.float32, (6,)), (25, np.float64, (2, 3)),
+])  # fmt: skip
 def test_maps_keep_type_dtype_and_shape_of_numpy_and_torch_and_leave_their_input_alone(name, width, dtype, shape):
     obs = states(width, shape, dtype=dtype)
     tensor, before = torch.from_numpy(obs.copy()), obs.copy()
@@ -220,10 +208,9 @@ def test_maps_keep_type_dtype_and_shape_of_numpy_and_torch_and_leave_their_input
         assert max(difference(out, exact), difference(tensor_out.numpy(), exact)) < tolerance
 
 
-@pytest.mark.parametrize("width", [22, 25])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_an_array_of_angles_turns_each_state_by_its_own(width, dtype):
-    obs = states(width, (5, 3), dtype=dtype)
+def test_an_array_of_angles_turns_each_state_by_its_own(dtype):
+    obs = states(25, (5, 3), dtype=dtype)
     angles = np.random.default_rng(1).uniform(-2 * PI, 2 * PI, (5, 3)).astype(dtype)
     for array, turn in ((obs, angles), (torch.from_numpy(obs), torch.from_numpy(angles))):
         out = gas.rotate(array, turn)
@@ -235,9 +222,8 @@ def test_an_array_of_angles_turns_each_state_by_its_own(width, dtype):
         assert difference(gas.rotate(array, turn[0])[4], gas.rotate(array[4], turn[0])) == 0
 
 
-@pytest.mark.parametrize("width", [22, 25])
-def test_rotate_keeps_the_first_angle_within_the_half_open_circle_and_is_undone_by_its_inverse(width):
-    obs = states(width, (500,))
+def test_rotate_keeps_the_first_angle_within_the_half_open_circle_and_is_undone_by_its_inverse():
+    obs = states(25, (500,))
     for angle in (*ANGLES, 7.0, -100.0):
         out = gas.rotate(obs, angle)
         assert np.all((out[:, 0] >= -PI) & (out[:, 0] < PI))
@@ -248,37 +234,34 @@ def test_rotate_keeps_the_first_angle_within_the_half_open_circle_and_is_undone_
 def test_canonical_has_no_base_angle_is_idempotent_and_the_same_for_every_rotated_world(width):
     obs = states(width)
     out = gas.canonical(obs)
-    for first, value in ((0, 0.0), (4, 0.0), (8, 1.0)):
-        assert np.all(out[:, first] == value)
+    base = [INDEX["p2p"][name].start for name in ("q", "sin q", "cos q")]
+    for array in (out, gas.canonical(obs.astype(np.float32)), gas.canonical(torch.from_numpy(obs)).numpy()):
+        assert np.all(array[:, base] == (0, 0, 1))
     assert np.array_equal(gas.canonical(out), out)
     for angle in ANGLES:
         assert difference(gas.canonical(gas.rotate(obs, angle)), out) < 1e-12
     assert difference(gas.canonical(gas.rotate(obs, np.linspace(-PI, PI, 50))), out) < 1e-12
-    for single in (obs.astype(np.float32), torch.from_numpy(obs.astype(np.float32))):
-        for first, value in ((0, 0.0), (4, 0.0), (8, 1.0)):
-            assert bool((gas.canonical(single)[:, first] == value).all())
     # it is a rotation: nothing else is lost
     assert difference(gas.rotate(out, -obs[:, 0]), obs) < 1e-12
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_goal_minus_error_turns_as_the_tcp_does_and_is_the_tcp_of_the_rotated_joints(task):
-    obs, *_ = rollout(task, RANDOM[:50], PLACES if task == "p2p" else ASIDE)
+def test_goal_minus_error_turns_as_the_tcp_does_and_is_the_tcp_of_the_rotated_joints():
+    obs, *_ = rollout("p2po", RANDOM[:50], ASIDE)
+    P_g, e = INDEX["p2po"]["P_g"], INDEX["p2po"]["e"]
     for angle in ANGLES:
         out = gas.rotate(obs, angle)
-        here, there = (o[:, 16:19] - o[:, 19:22] for o in (obs, out))
+        here, there = (o[:, P_g] - o[:, e] for o in (obs, out))
         c, s = math.cos(angle), math.sin(angle)
         assert np.abs(there - here @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])).max() < 1e-6
         assert np.abs(there - [tcp(q) for q in out[:, :4]]).max() < 1e-6
         # what the reward is made of: lengths do not change
-        assert np.abs(np.linalg.norm(out[:, 19:22], axis=1) - np.linalg.norm(obs[:, 19:22], axis=1)).max() < 1e-12
+        assert np.abs(np.linalg.norm(out[:, e], axis=1) - np.linalg.norm(obs[:, e], axis=1)).max() < 1e-12
 
 
 # ---- partitions ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("K", [1, 2, 3, 4, 5, 8])
+@pytest.mark.parametrize("task, K", [("p2p", 4), ("p2p", 1), ("p2po", 5), ("pnp", 3)])
 def test_demonstrations_start_in_the_partition_they_were_drawn_in(task, K):
     env = KinovaEnv(task, "demo", K)
     for k in range(K):
@@ -291,14 +274,13 @@ def test_demonstrations_start_in_the_partition_they_were_drawn_in(task, K):
 def at(task, theta):
     """A state whose TCP is at this azimuth (theta: (...))."""
     theta = np.asarray(theta)
-    obs = states(WIDTH[task], theta.shape)
+    obs = states(OBS_DIM[task], theta.shape)
     place = np.stack([0.5 * np.cos(theta), 0.5 * np.sin(theta), np.full(theta.shape, 0.4)], axis=-1)
-    obs[..., 19:22] = obs[..., 16:19] - place
+    obs[..., INDEX[task]["e"]] = obs[..., INDEX[task]["P_g"]] - place
     return obs
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("K", [2, 3, 4, 8])
+@pytest.mark.parametrize("task, K", [("p2p", 4), ("p2po", 3), ("pnp", 8)])
 def test_partition_changes_where_the_sectors_of_the_environment_meet(task, K):
     env = KinovaEnv(task, "demo", K)
     half = PI / K
@@ -312,7 +294,7 @@ def test_partition_changes_where_the_sectors_of_the_environment_meet(task, K):
     env.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", ["p2p", "pnp"])
 def test_partition_numbers_are_whole_have_the_batch_shape_and_count_up_under_phi(task):
     obs = at(task, np.random.default_rng(0).uniform(-PI, PI, (6, 5)))
     for K in (1, 3, 4):
@@ -339,8 +321,7 @@ def demonstration(task, k, K, options):
     return rows | {name: np.array([value]) for name, value in whole.items()}
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("K", [3, 4])
+@pytest.mark.parametrize("task, K", [("p2p", 4), ("p2po", 3), ("pnp", 4)])
 def test_aggregated_images_are_the_simulated_demonstrations_of_their_partitions(task, K):
     centre = -PI / K if task == "p2p" else 0.0
     options = {"start": (centre, 0.52, 0.42), "goal": (centre - 0.5, 0.45, 0.5)}
@@ -352,12 +333,12 @@ def test_aggregated_images_are_the_simulated_demonstrations_of_their_partitions(
     assert images["partition"].tolist() == list(range(K)) and images["success"].all()
     for k in range(K):
         real = demonstration(task, k, K, options)
-        mine = images["episode"] == k
-        assert images["length"][k] == real["length"][0] == mine.sum()
+        image = images["episode"] == k
+        assert images["length"][k] == real["length"][0] == image.sum()
         for name in ("obs", "obs2"):
-            assert difference(images[name][mine], real[name]) < 1e-6
+            assert difference(images[name][image], real[name]) < 1e-6
         for name in ("act", "rew", "terminated", "truncated"):
-            assert np.abs(images[name][mine] - real[name].astype(float)).max() < 1e-6
+            assert np.abs(images[name][image] - real[name].astype(float)).max() < 1e-6
         assert images["return"][k] == pytest.approx(real["return"][0], abs=1e-6)
         assert images["success"][k] == real["success"][0]
 
@@ -370,7 +351,7 @@ def demos():
     return demos
 
 
-@pytest.mark.parametrize("K", [2, 4, 5])
+@pytest.mark.parametrize("K", [2, 4])
 def test_aggregate_gives_each_episode_of_partition_0_and_then_its_images_and_nothing_else(demos, K):
     before = {name: column.copy() for name, column in demos.items()}
     out = gas.aggregate(demos, K)
@@ -384,11 +365,11 @@ def test_aggregate_gives_each_episode_of_partition_0_and_then_its_images_and_not
     for n, source in enumerate(sources):
         theirs = demos["episode"] == source
         for k in range(K):
-            mine = out["episode"] == n * K + k
+            image = out["episode"] == n * K + k
             for name in ("act", "rew", "terminated", "truncated"):  # phi changes neither
-                assert np.array_equal(out[name][mine], demos[name][theirs])
+                assert np.array_equal(out[name][image], demos[name][theirs])
             for name in ("obs", "obs2"):
-                assert np.array_equal(out[name][mine], gas.phi(demos[name][theirs], k, K))
+                assert np.array_equal(out[name][image], gas.phi(demos[name][theirs], k, K))
     for name, column in demos.items():
         assert out[name].dtype == column.dtype and column.tobytes() == before[name].tobytes()
         assert len(out[name]) == (out["length"].sum() if name in ROWS else K * len(sources))
