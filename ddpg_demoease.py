@@ -79,7 +79,7 @@ class Flags(logx.RunFlags):
     lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
 
 
-TASK_DEFAULTS = {  # Table 1, Sec. 4.2; the paper trains pnp with PPO: its sizes, 250 epochs (ours)
+TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5; epochs of pnp: ours
     "p2p": dict(epochs=250, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
     "p2po": dict(epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
@@ -119,7 +119,8 @@ def resolve(flags):
 
 
 class ReplayBuffer:
-    """Transitions (s, a, r, s', discount) in a ring; discount = gamma (1 - zeta) is what the value of s' counts for.
+    """Transitions (s, a, r, s', discount) in a ring; discount is what the value of s' counts for: gamma (1 - zeta), or
+    gamma^n (1 - zeta) after n rewards.
 
     Here the symmetry meets the data: `canonical` turns each state as it is stored, `so2` each sample by a random angle.
     """
@@ -143,7 +144,7 @@ class ReplayBuffer:
         s, a, r, s2, discount = self.rows[i].split(self.widths, dim=1)
         if self.symmetry == "so2":
             angle = 2 * math.pi * torch.rand(len(i))
-            s, a, s2 = gas.rotate(s, angle), gas.psi(a, angle), gas.rotate(s2, angle)
+            s, s2 = gas.rotate(s, angle), gas.rotate(s2, angle)  # psi is the identity: a stays
         return [x.to(device) for x in (s, a, r.squeeze(1), s2, discount.squeeze(1))]
 
     def state(self):
@@ -280,23 +281,17 @@ class Learner:
         self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.critics, f.critic_layernorm).to(f.device)
         self.target = deepcopy(self.net).requires_grad_(False)
         self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_nets.parameters())
-        self.optimizer = torch.optim.Adam([dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)],
-                                          fused=True)  # fmt: skip
-        self.target_parameters, self.move_targets = list(self.target.parameters()), get_ema_multi_avg_fn(f.polyak)
+        groups = dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)
+        self.optimizer = torch.optim.Adam(groups, fused=True)
+        self.move_targets = get_ema_multi_avg_fn(f.polyak)
         self.actor = self.net if f.device == "cpu" else deepcopy(self.net).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     @torch.inference_mode()
     def act(self, s):
-        """pi_mu of one observation, as the networks see it: (4,) numpy."""
+        """pi_mu of one observation of the environment: (4,) numpy."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
         return self.actor.pi(torch.from_numpy(s)).numpy()
-
-    def decay_learning_rates(self, remaining):
-        """Linearly to 0 over the second half of the run. remaining: the fraction of it that is still to come."""
-        f = self.flags
-        for group, lr in zip(self.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-            group["lr"] = lr * min(1.0, remaining / 0.5)
 
     def updates(self, B_o, B_d, n):
         """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
@@ -321,7 +316,7 @@ class Learner:
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
         u, u_demo = net.u(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
         a_hat = torch.tanh(u_demo)
-        L_O = loss_O(net.Qs(s, torch.tanh(u), first=1))
+        L_O = loss_O(net.Qs(s, torch.tanh(u), first=1))  # of two critics the first alone (TD3)
         with torch.no_grad():
             Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat)
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
@@ -335,7 +330,7 @@ class Learner:
             L_A.backward(inputs=self.mu)
         self.optimizer.step()
         # mu' <- omega mu' + (1 - omega) mu, and nu' alike
-        self.move_targets(self.target_parameters, [*self.mu, *self.nu], None)
+        self.move_targets(list(self.target.parameters()), list(self.net.parameters()), None)
         if not measure:
             return None
         return [x.detach() for x in (
@@ -453,7 +448,9 @@ def loop(f, run):
         # update
         if t >= f.update_after and t % f.update_every == 0 and B_o.filled:
             if f.lr_decay:
-                learner.decay_learning_rates(remaining=1 - t / run.total_steps)
+                second_half = min(1.0, 2 * (1 - t / run.total_steps))
+                for group, lr in zip(learner.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
+                    group["lr"] = lr * second_half
             n = math.floor(f.updates_per_step * t) - math.floor(f.updates_per_step * (t - f.update_every))
             if n:
                 run.log_updates(learner.updates(B_o, B_d, n), learner.net)

@@ -59,7 +59,7 @@ class Flags(logx.RunFlags):
     clip_ratio: float = flag(0.2, "epsilon", low=0)
     target_kl: float = flag(0.02, "largest D_KL from the policy that acted, on its own samples", low=0)
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
-    vf_lr: float = flag(1e-3, "of the critic", low=0)
+    vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
     mask: str | None = flag(None, "reward: V(s) < R(s, a), Eq. 9; return: V(s) < the demonstrated reward-to-go; "
@@ -74,7 +74,7 @@ class Flags(logx.RunFlags):
     clip_value: bool | None = flag(None, "clip V to the range of possible returns")
 
 
-TASK_DEFAULTS = {  # Table 2, Sec. 4.2; the paper trains p2p and p2po with DDPG: their sizes
+TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
     "p2p": dict(num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128)),
     "p2po": dict(num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
@@ -138,7 +138,7 @@ class TrajectoryBuffer:
         rows = self.rows[: self.filled] if i is None else self.rows[i]
         s, a, r, s2, *rest = (x.squeeze(1) if x.shape[1] == 1 else x for x in rows.split(self.widths, dim=1))
         if angle is not None:
-            s, a, s2 = gas.rotate(s, angle), gas.psi(a, angle), gas.rotate(s2, angle)
+            s, s2 = gas.rotate(s, angle), gas.rotate(s2, angle)  # psi is the identity: a stays
         return s, a, r, s2, *rest
 
 
@@ -209,7 +209,7 @@ class ActorCritic(nn.Module):
 
 
 def gaussian(mu, sigma):
-    """N(mu, sigma), the four actions independent. NaN is found by the losses, so not here again."""
+    """N(mu, sigma), the four actions independent. A weight that is NaN is found by logx, so not here."""
     return Independent(Normal(mu, sigma, validate_args=False), 1, validate_args=False)
 
 
@@ -268,7 +268,7 @@ class Learner:
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
         return self.actor.mu(torch.from_numpy(s)).numpy(), self.actor.log_std.exp().numpy()
 
-    def V(self, s):
+    def clipped_V(self, s):
         """V_nu(s), with clip_value within possible returns."""
         V = self.net.V(s)
         return V.clamp(*self.return_range) if self.flags.clip_value else V
@@ -310,8 +310,8 @@ class Learner:
         with torch.no_grad():
             mu_old, sigma_old = net.mu(s), net.log_std.exp()
             log_prob_old = net.pi(mu_old).log_prob(a)
-            V = self.V(s)
-            last_V = torch.where(end > 0, (1 - zeta) * self.V(s2), 0.0)  # a timeout is no true end
+            V = self.clipped_V(s)
+            last_V = torch.where(end > 0, (1 - zeta) * self.clipped_V(s2), 0.0)  # a timeout is no true end
         R = discounted_sum(r, end, last_V, f.gamma).to(f.device)
         A = advantages(r, end, V, last_V, f.gamma, f.lam).to(f.device)
 
@@ -336,7 +336,7 @@ class Learner:
                 a_hat = net.mu(s_demo)
                 with torch.no_grad():
                     threshold = {"reward": r_demo, "return": R_demo_i, "none": torch.inf}[f.mask]
-                    M = mask(self.V(s_demo), threshold)
+                    M = mask(self.clipped_V(s_demo), threshold)
                 L_BC = loss_BC(a_demo, a_hat, M)
                 if within_kl or f.after_kl == "all":
                     L_A = loss_A(L_O if within_kl else 0.0, L_BC, f.lambda_bc)
@@ -402,9 +402,8 @@ def loop(f, run):
     ends = [0, *(1 + torch.nonzero(demo_rows[:, -2]).flatten()).tolist()]  # of demonstration n: rows ends[n] ...
     B_o, B_d = (TrajectoryBuffer(OBS_DIM[f.task], n, f.symmetry) for n in (f.steps_per_epoch + len(demo_rows), 0))
     B_d.rows = demo_rows  # there from the start, and "filled" as the epochs open with them
-    zeta, end = demo_rows[:, -3], demo_rows[:, -2]
-    r_demo = demo_rows[:, OBS_DIM[f.task] + 4]
-    R_demo = discounted_sum(r_demo, end, torch.zeros_like(zeta), f.gamma)  # no V yet: nothing follows a timeout
+    _, _, r_demo, _, _, end, _ = B_d.columns(slice(None))
+    R_demo = discounted_sum(r_demo, end, torch.zeros_like(end), f.gamma)  # no V yet: nothing follows a timeout
 
     def open_epoch(shown):
         """Demonstrations, until B_d is full (Alg. 2); shown: how many it held. Returns how many it holds."""

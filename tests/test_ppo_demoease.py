@@ -360,7 +360,7 @@ def test_clip_value_holds_values_within_the_possible_returns():
             with torch.no_grad():
                 learner.net.v_net[-1].weight.zero_()
                 learner.net.v_net[-1].bias.fill_(value)
-                assert learner.V(torch.zeros(1, ppo.OBS_DIM[task])).item() == clipped
+                assert learner.clipped_V(torch.zeros(1, ppo.OBS_DIM[task])).item() == clipped
 
 
 # ---- before the first step -------------------------------------------------------------------------------------------
