@@ -6,11 +6,9 @@
     python ddpg_demoease.py --num_demos 0 --lambda_bc 0     # plain DDPG
     python ddpg_demoease.py --seed 1 --resume               # where it stopped
 
-`--recipe paper`, the default, is the algorithm as published (Table 1), 500,000
-steps on P2P. `--recipe robust` adds a few parts, each a flag of its own, and
-carries its own length. What they reach, in how many minutes, with how many
-seeds: data/results/README.md. Differences from the paper: DIFFERENCES.md.
-A run is a folder, DATA_DIR/NAME (logx.py).
+`--recipe paper`, the default, is the algorithm as published (Table 1); `robust`
+adds parts, each a flag of its own. What they reach, in how many minutes:
+data/results/README.md. Differences from the paper: DIFFERENCES.md.
 """
 
 import math
@@ -295,14 +293,14 @@ class Learner:
 
     def updates(self, B_o, B_d, n):
         """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
-        for i in range(n):
-            measured = self.update(B_o, B_d, measure=i == n - 1)
+        for _ in range(n):
+            measured = self.update(B_o, B_d)
         if self.actor is not self.net:
             self.actor.load_state_dict(self.net.state_dict())
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
-    def update(self, B_o, B_d, measure=False, hold_actor=False):
-        """One gradient step on a batch of B_o and one of B_d (None: no cloning). measure: returns MEASURED, tensors."""
+    def update(self, B_o, B_d, hold_actor=False):
+        """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
         f, net, target = self.flags, self.net, self.target
         s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
 
@@ -331,8 +329,6 @@ class Learner:
         self.optimizer.step()
         # mu' <- omega mu' + (1 - omega) mu, and nu' alike
         self.move_targets(list(self.target.parameters()), list(self.net.parameters()), None)
-        if not measure:
-            return None
         return [x.detach() for x in (
             L_O, L_BC, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
             # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
@@ -360,8 +356,7 @@ class Learner:
             self.update(B_o, B_d, hold_actor=True)
 
     def state(self):
-        return {"net": self.net.state_dict(), "target": self.target.state_dict(),
-                "optimizer": self.optimizer.state_dict()}  # fmt: skip
+        return {name: getattr(self, name).state_dict() for name in ("net", "target", "optimizer")}
 
     def load(self, state):
         for name, part in state.items():
@@ -419,10 +414,6 @@ def loop(f, run):
             learner.clone(B_o, B_d)
     run.begin(demo_env_steps)
 
-    def save():
-        parts = {"learner": learner.state(), "B_o": B_o.state(), "B_d": B_d and B_d.state(), "env": env.state()}
-        run.save(parts | {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}, learner.policy())
-
     while t < run.total_steps:
         # act
         if t < f.start_steps:
@@ -459,7 +450,9 @@ def loop(f, run):
         if t % f.steps_per_epoch == 0:
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
         if run.must_save(t):
-            save()
+            parts = {"learner": learner.state(), "B_o": B_o.state(), "B_d": B_d and B_d.state(), "env": env.state()}
+            parts |= {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
+            run.save(parts, learner.policy())
             run.stop_if_asked(t)
     env.close()
 

@@ -426,11 +426,6 @@ def loop(f, run):
             learner.clone(B_d, R_demo)
     run.begin(demo_env_steps)
 
-    def save():
-        parts = {"learner": learner.state(), "B_o": B_o.rows[: B_o.filled].clone(), "demo_rows": demo_rows,
-                 "shown": shown, "env": env.state()}  # fmt: skip
-        run.save(parts | {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}, learner.policy())
-
     while t < run.total_steps:
         # act
         mu, sigma = learner.act(s)
@@ -455,7 +450,10 @@ def loop(f, run):
             shown = open_epoch(shown)
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
         if run.must_save(t):
-            save()
+            parts = {"learner": learner.state(), "B_o": B_o.rows[: B_o.filled].clone(), "demo_rows": demo_rows,
+                     "shown": shown, "env": env.state()}  # fmt: skip
+            parts |= {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
+            run.save(parts, learner.policy())
             run.stop_if_asked(t)
     env.close()
 
