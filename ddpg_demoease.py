@@ -1,7 +1,6 @@
 """Off-policy Demo-EASE (Alg. 1): DDPG with demonstrations and masked cloning.
 
     python ddpg_demoease.py --task p2p --recipe robust      # learns in minutes
-    python ddpg_demoease.py --task p2po --recipe robust
     python ddpg_demoease.py --task p2p                      # as published
     python ddpg_demoease.py --num_demos 0 --lambda_bc 0     # plain DDPG
     python ddpg_demoease.py --seed 1 --resume               # where it stopped
@@ -282,21 +281,18 @@ class Learner:
         groups = dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.move_targets = get_ema_multi_avg_fn(f.polyak)
-        self.actor = self.net if f.device == "cpu" else deepcopy(self.net).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     @torch.inference_mode()
     def act(self, s):
         """pi_mu of one observation of the environment: (4,) numpy."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
-        return self.actor.pi(torch.from_numpy(s)).numpy()
+        return self.net.pi(torch.from_numpy(s).to(self.flags.device)).cpu().numpy()
 
     def updates(self, B_o, B_d, n):
         """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
         for _ in range(n):
             measured = self.update(B_o, B_d)
-        if self.actor is not self.net:
-            self.actor.load_state_dict(self.net.state_dict())
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
     def update(self, B_o, B_d, hold_actor=False):
@@ -336,8 +332,7 @@ class Learner:
         )]  # fmt: skip
 
     def clone(self, B_o, B_d):
-        """Before the first step: observations are normalised by B_d, then clone_iters updates of the actor on B_d with
-        M = 1, and of the critic alone."""
+        """Before the first step: normalisation by B_d; clone_iters updates of the actor, M = 1, then of the critic."""
         f, net = self.flags, self.net
         if f.normalize_obs:
             s = B_d.rows[:, : OBS_DIM[f.task]]
@@ -351,7 +346,6 @@ class Learner:
             L_BC.backward()
             self.optimizer.step()
         self.target.load_state_dict(net.state_dict())
-        self.actor.load_state_dict(net.state_dict())
         for _ in trange(f.clone_iters, desc="critic following", disable=f.quiet or None):
             self.update(B_o, B_d, hold_actor=True)
 
@@ -361,7 +355,6 @@ class Learner:
     def load(self, state):
         for name, part in state.items():
             getattr(self, name).load_state_dict(part)
-        self.actor.load_state_dict(self.net.state_dict())
 
     def policy(self):
         """What policy.pt holds."""
@@ -372,10 +365,8 @@ class Learner:
 
 
 def train(flags):
-    """Runs Alg. 1 to the end, or on from the checkpoint. flags: Flags. Returns the run's folder (Path).
-
-    Raises logx.BadInput, logx.NotFinite, and KeyboardInterrupt with the state saved.
-    """
+    """Runs Alg. 1 to the end, or on from the checkpoint. Returns the run's folder (Path). Raises logx.BadInput,
+    logx.NotFinite, and KeyboardInterrupt with the state saved."""
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)
@@ -417,13 +408,12 @@ def loop(f, run):
     while t < run.total_steps:
         # act
         if t < f.start_steps:
-            a = rng.uniform(-1, 1, 4).astype(np.float32)
+            a = rng.uniform(-1, 1, 4)
         else:
-            a = learner.act(s) + f.act_noise * rng.standard_normal(4)
-            a = np.clip(a, -1, 1).astype(np.float32)
+            a = np.clip(learner.act(s) + f.act_noise * rng.standard_normal(4), -1, 1)
 
         # step, store
-        s, _, terminated, truncated, info = env.step(a)
+        s, _, terminated, truncated, info = env.step(a.astype(np.float32))
         t += 1
         store_last_step(B_o, env.episode, f.n_step, f.gamma, f.timeout_ends)
 
@@ -439,9 +429,8 @@ def loop(f, run):
         # update
         if t >= f.update_after and t % f.update_every == 0 and B_o.filled:
             if f.lr_decay:
-                second_half = min(1.0, 2 * (1 - t / run.total_steps))
                 for group, lr in zip(learner.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-                    group["lr"] = lr * second_half
+                    group["lr"] = lr * min(1.0, 2 * (1 - t / run.total_steps))  # 1 over the first half
             n = math.floor(f.updates_per_step * t) - math.floor(f.updates_per_step * (t - f.update_every))
             if n:
                 run.log_updates(learner.updates(B_o, B_d, n), learner.net)

@@ -13,7 +13,6 @@ DIFFERENCES.md. A run is a folder, DATA_DIR/NAME (logx.py).
 """
 
 import math
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import gymnasium
@@ -256,7 +255,6 @@ class Learner:
         self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.log_std, f.grasp_input).to(f.device)
         self.omega, self.nu = [*self.net.mu_net.parameters(), self.net.log_std], list(self.net.v_net.parameters())
         self.optimizer = self.adam(f.pi_lr, f.vf_lr)
-        self.actor = self.net if f.device == "cpu" else deepcopy(self.net).cpu()  # what acts
         self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     def adam(self, pi_lr, vf_lr):
@@ -266,7 +264,8 @@ class Learner:
     def act(self, s):
         """mu and sigma of one observation, (4,) numpy each."""
         s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
-        return self.actor.mu(torch.from_numpy(s)).numpy(), self.actor.log_std.exp().numpy()
+        mu = self.net.mu(torch.from_numpy(s).to(self.flags.device))
+        return mu.cpu().numpy(), self.net.log_std.exp().cpu().numpy()
 
     def clipped_V(self, s):
         """V_nu(s), with clip_value within possible returns."""
@@ -297,7 +296,6 @@ class Learner:
             loss.backward()
             optimizer.step()
             decay.step()
-        self.actor.load_state_dict(net.state_dict())
 
     def updates(self, B_o, B_d, R_demo):
         """The N_up updates of an epoch (B_d empty: no cloning). Returns {name: float}, means over them."""
@@ -350,8 +348,6 @@ class Learner:
                 L_O, L_BC, L_C, L_O.new_full((), math.nan) if L_A is None else L_A, M.mean(), V_s.mean(), V_s.max(),
                 mu[own_i].abs().mean(), mean_action_demo, bc_relative_error, D_KL, net.log_std.exp().mean(),
             )])  # fmt: skip
-        if self.actor is not net:
-            self.actor.load_state_dict(net.state_dict())
         if not measured:
             return None
         return dict(zip(MEASURED, torch.tensor(measured).nanmean(0).tolist(), strict=True))
@@ -362,7 +358,6 @@ class Learner:
     def load(self, state):
         for name, part in state.items():
             getattr(self, name).load_state_dict(part)
-        self.actor.load_state_dict(self.net.state_dict())
 
     def policy(self):
         """What policy.pt holds."""
@@ -373,10 +368,8 @@ class Learner:
 
 
 def train(flags):
-    """Runs Alg. 2 to the end, or on from the checkpoint. flags: Flags. Returns the run's folder (Path).
-
-    Raises logx.BadInput, logx.NotFinite, and KeyboardInterrupt with the state saved.
-    """
+    """Runs Alg. 2 to the end, or on from the checkpoint. Returns the run's folder (Path). Raises logx.BadInput,
+    logx.NotFinite, and KeyboardInterrupt with the state saved."""
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)

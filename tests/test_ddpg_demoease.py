@@ -442,15 +442,6 @@ def test_normalize_obs_is_by_mean_and_deviation_of_the_demonstrated_states_or_a_
         torch.testing.assert_close(seen.std(0), std / std.clamp(min=0.2), rtol=1e-3, atol=1e-4)
 
 
-def test_the_policy_that_acts_elsewhere_than_it_learns_is_the_cloned_one():
-    """As with --device cuda."""
-    learner = ddpg.Learner(resolve(hidden_sizes=(8,), clone_iters=2, symmetry="none"))
-    learner.actor = ddpg.deepcopy(learner.net)
-    learner.clone(Fixed(*random_batch(9)), Fixed(*random_batch(9)))
-    s = states(1)[0]
-    assert np.array_equal(learner.act(s), learner.net.pi(torch.from_numpy(s)).detach().numpy())
-
-
 # ---- defaults --------------------------------------------------------------------------------------------------------
 
 DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 5; 5 T, 2 T and T are ours
