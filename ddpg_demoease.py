@@ -87,8 +87,7 @@ PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noi
 ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
               normalize_obs=True, hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True,
               clip_target=True, lr_decay=True, start_steps=0)  # fmt: skip
-ROBUST_TASK = {"p2p": dict(epochs=25, steps_per_epoch=1000), "p2po": dict(epochs=40),
-               "pnp": dict(epochs=50, hindsight=0)}  # another goal would not say where the cube is grasped
+ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
 
 
 def recipe_defaults(task, recipe, max_ep_len=None):
@@ -105,10 +104,9 @@ def resolve(flags):
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len), "ddpg")
     if flags.hindsight and flags.task == "pnp":
-        raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp")
+        raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp, where a grasp has no goal")
     if flags.clone_iters and not flags.demos_in_B_o:
-        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: its critic learns from the demonstrations in B_o; "
-                            "with --no-demos_in_B_o 0 is allowed")  # fmt: skip
+        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: needs demonstrations in B_o, else 0 is allowed")
     return flags
 
 
@@ -116,8 +114,7 @@ def resolve(flags):
 
 
 class ReplayBuffer:
-    """Transitions (s, a, r, s', discount) in a ring; discount is what the value of s' counts for: gamma (1 - zeta), or
-    gamma^n (1 - zeta) after n rewards.
+    """Transitions (s, a, r, s', discount) in a ring; the value of s' counts for discount = gamma^n (1 - zeta).
 
     Here the symmetry meets the data: `canonical` turns each state as it is stored, `so2` each sample by a random angle.
     """
@@ -162,8 +159,7 @@ def n_step_sum(steps, gamma, timeout_ends=False):
 
 
 def store_last_step(B, episode, n, gamma, timeout_ends=False):
-    """Stores what the last step of an episode completes: the transition of its last n steps, and at the episode's end
-    the shorter ones too."""
+    """Stores the transition of the episode's last n steps; at its end the shorter ones too."""
     ended = episode[-1][4] or episode[-1][5]
     for m in range(min(n, len(episode)), 0 if ended else n - 1, -1):
         B.store(*n_step_sum(episode[-m:], gamma, timeout_ends))
@@ -299,7 +295,6 @@ class Learner:
         """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
         f, net, target = self.flags, self.net, self.target
         s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
-
         with torch.no_grad():  # y is a constant: no gradient through the targets
             y = r + discount * target.Q(s2, target.pi(s2))
             if f.clip_target:
@@ -316,7 +311,6 @@ class Learner:
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
-
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
         L_C.backward()
@@ -397,10 +391,9 @@ def loop(f, run):
     else:
         t, (s, _) = 0, env.reset()
         if demos:
-            n = len(demos["rew"])
-            if f.demos_in_B_o and n > f.replay_size:
-                raise logx.BadInput(f"--replay_size {f.replay_size}: must hold the {n} demonstrated steps")
-            B_d = ReplayBuffer(OBS_DIM[f.task], n, f.symmetry)
+            B_d = ReplayBuffer(OBS_DIM[f.task], len(demos["rew"]), f.symmetry)
+            if f.demos_in_B_o and len(B_d.rows) > f.replay_size:
+                raise logx.BadInput(f"--replay_size {f.replay_size}: must hold the {len(B_d.rows)} demonstrated steps")
             store_demonstrations(demos, B_o, B_d, f)
             learner.clone(B_o, B_d)
     run.begin(demo_env_steps)
