@@ -129,7 +129,7 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
     demos = {name: [] for name in ROWS | EPISODES}
     real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
     env.reset(seed=seed)
-    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
+    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet or None):
         s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
         rewards, efforts, terminated, truncated = [], [], False, False
         drift = np.zeros(4)
