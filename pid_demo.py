@@ -23,15 +23,30 @@ import numpy as np
 from tqdm import tqdm
 
 import gas
+import kinova_env
 import logx
 from kinova_env import EPSILON, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
-CLEARANCE = {"obstacle": 0.18, "object": 0.15}  # m, of the way above the cube on P2P-O, before it (at most) on P&P
-RETRACT = 0.3  # m, radius to which it draws back before it rises beside a cube on P2P-O
-RADIUS = 0.1  # m, over which one part of the way over P2P-O's cube becomes the next
+CLEARANCE = {"obstacle": 0.13, "object": 0.15}  # m, of the arm's axis from P2P-O's cube; before P&P's cube, at most
+ABOVE = 0.18  # m, of P2P-O's cube at which the TCP crosses it
+ASIDE = 0.19  # m, from P2P-O's cube to which the arm turns away before it rises
+BLEND = 0.1  # m, over which one part of the way over P2P-O's cube becomes the next
+PENALTY = 50.0  # rad of way that a metre of missing clearance is worth
+FINGERS, WIDER = 0.016, 0.04  # m: they reach beyond the TCP; the gripper reaches further to either side than the arm
 NOISE_KEPT = 0.9  # of the noise of one step in the next, 20 ms later
 GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
+
+
+def arm(folds):
+    """(r, z), each (M, 4) in m, of shoulder, elbow, wrist and finger tips in the arm's own plane.
+
+    folds: (M, 3), the joints that move within that plane: the paper's #2, #3 and #4 (rad).
+    """
+    tilt = folds[:, :1] - np.cumsum(folds * (0, 1, 1), axis=1)  # of each link, from the vertical
+    links = np.array((kinova_env.UPPER_ARM, kinova_env.FOREARM, kinova_env.HAND + FINGERS))
+    r, z = (np.cumsum(np.hstack([np.zeros((len(folds), 1)), links * f(tilt)]), axis=1) for f in (np.sin, np.cos))
+    return r, z + kinova_env.SHOULDER_HEIGHT
 
 
 class PID:
@@ -49,22 +64,47 @@ class PID:
         self.clearance = CLEARANCE.get(self.env.row.cube) if clearance is None else clearance
         self._episode = None
 
+    def _clearest(self, found, beside):
+        """Of postures (M, 4) the one nearest to the present, those left out that come nearer than `clearance` to the
+        cube as it lies `beside` rad from the arm's plane; where all do, the one that does least."""
+        q, (x, y, z_o), (r, z) = np.array(self.env.q), self.env.cube, arm(found[:, 1:])
+        rho = math.hypot(x, y)
+        dr, dz = np.diff(r), np.diff(z)
+        to_r, to_z = rho * math.cos(beside) - r[:, :-1], z_o - z[:, :-1]
+        t = np.clip((to_r * dr + to_z * dz) / (dr**2 + dz**2), 0, 1)  # the point of each link nearest to the cube
+        aside = np.maximum(0, abs(rho * math.sin(beside)) - np.array((0, 0, WIDER)))
+        clear = np.sqrt((to_r - t * dr) ** 2 + (to_z - t * dz) ** 2 + aside**2).min(1)
+        way = np.hypot(wrap(found[:, 0] - q[0]), np.linalg.norm(found[:, 1:] - q[1:], axis=1))
+        return found[np.argmin(way + PENALTY * np.maximum(0, self.clearance - clear))]
+
     def _over(self):
-        """A posture on the way over P2P-O's cube (Sec. 3.2): rise above it, cross, descend, blended over `radius`;
-        first draw back where a rise would meet the cube. A function of the state, not of what was reached before.
+        """A posture on the way over P2P-O's cube, by midway points (Sec. 3.2): rise above it, cross, descend.
+
+        Beside the cube the arm first turns away from it. A function of the state, not of what was reached before, which
+        changes gradually: a clone of the demonstrations can follow it.
         """
-        (x, y, z), (x_g, y_g, z_g), (x_o, y_o, z_o) = self.env.tcp, self.env.goal, self.env.cube
-        to_go = math.dist((x, y), (x_g, y_g)) / RADIUS
-        height = z_g + max(0, z_o + self.clearance - z_g) * min(1, max(0, to_go - 1))
+        places = (self.env.tcp, self.env.goal, self.env.cube)
+        (x, y, z), (x_g, y_g, z_g), (x_o, y_o, z_o) = places
+        to_goal, to_cube = math.dist((x, y), (x_g, y_g)), math.dist((x, y), (x_o, y_o))  # horizontally
+        apart = math.dist((x_g, y_g), (x_o, y_o))
+        azimuth, of_goal, of_cube = (math.atan2(place[1], place[0]) for place in places)
+        turn, beside = wrap(of_goal - azimuth), wrap(of_cube - azimuth)
+
+        descend = np.clip(min(2 - to_goal / BLEND, (to_cube / min(apart, 0.16) - 0.55) / 0.25), 0, 1)
+        height = z_g + max(0, z_o + ABOVE - z_g) * (1 - descend)
         found = postures((x_g, y_g, height))
-        cross = self._nearest(found if len(found) else postures(self.env.goal))
-        below = min(1, max(0, (height - z) / RADIUS))
-        close = min(1, max(0, (self.clearance - math.dist((x, y), (x_o, y_o))) / RADIUS))
-        back = 1 + (RETRACT / math.hypot(x, y) - 1) * close
-        found = postures((x * back, y * back, z + (height - z) * (1 - close)))
+        passes = 0 < beside * np.sign(turn) < abs(turn)
+        nearest = 0 if passes else min(abs(beside), abs(wrap(beside - turn)))  # that the turn brings it to the cube
+        cross = self._clearest(found if len(found) else postures(self.env.goal), nearest)
+
+        close = np.clip((ASIDE - 0.01 - to_cube) / 0.05, 0, 1)
+        away = max(0, math.asin(min(1, ASIDE / math.hypot(x_o, y_o))) - abs(beside)) * (close > 0)
+        rise = z + (height - z) * (1 - close)
+        found = postures(kinova_env.cartesian(azimuth - math.copysign(away, beside), math.hypot(x, y), rise))
+        below = np.clip((height - z) / BLEND, 0, 1)
         if not below or not len(found):
             return cross
-        way = self._nearest(found) - cross
+        way = self._clearest(found, beside) - cross
         way[0] = wrap(way[0])
         return cross + below * way
 
@@ -129,7 +169,7 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
     demos = {name: [] for name in ROWS | EPISODES}
     real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
     env.reset(seed=seed)
-    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet or None):
+    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
         s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
         rewards, efforts, terminated, truncated = [], [], False, False
         drift = np.zeros(4)
@@ -326,8 +366,8 @@ def main():
             meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))
             logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **demos, meta=np.array(meta)))
     except OSError as error:
-        path = flags.gif or flags.out
-        raise logx.BadInput(f"{path}: cannot be written ({error.strerror or error})") from None
+        name = "gif" if flags.gif else "out"
+        raise logx.BadInput(f"--{name} {getattr(flags, name)}: cannot be written ({error.strerror or error})") from None
     except ValueError as error:  # sectors too narrow, no display
         raise logx.BadInput(f"--{'watch: ' * flags.watch}{error}") from None
     won = demos["success"]

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 import gas
+import kinova_env
 import logx
 import pid_demo
 from kinova_env import INDEX, OBS_DIM, TASKS, TIME_STEP, cartesian, postures, tcp, wrap
@@ -160,6 +161,66 @@ def test_fast_gains_succeed_in_at_least_95_percent_and_in_fewer_steps_than_the_a
     both = fast["success"] & authors["success"]
     assert np.all(fast["length"][both] < authors["length"][both])
     assert fast["length"].mean() < 0.6 * authors["length"].mean()
+
+
+@pytest.mark.parametrize("task", ["p2po", "pnp"])
+def test_way_past_or_to_the_cube_depends_on_the_state_alone_not_on_what_was_reached_before(make, task):
+    env = make(task, stage="test")
+    pid, compared = PID(env, "fast"), 0
+    rng = np.random.default_rng(0)
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(150):
+            a = pid.act()
+            if not env.unwrapped.grasped:
+                assert np.array_equal(PID(env, "fast").act(), a)
+                compared += 1
+            if env.step(np.clip(a + 0.3 * rng.standard_normal(4), -1, 1).astype(np.float32))[2]:
+                break
+    assert compared > 200
+
+
+def test_way_over_the_cube_rises_before_it_crosses_and_crosses_before_it_descends(make):
+    env = make("p2po")
+    start, goal, cube = (0.0, 0.52, 0.42), (-0.7, 0.5, 0.4), (-0.35, 0.5, 0.42)
+    env.reset(seed=0, options={"start": start, "goal": goal, "object": cube})
+    pid, path = PID(env, "fast"), []
+    for _ in range(400):
+        path.append(env.unwrapped.tcp)
+        _, _, terminated, truncated, info = env.step(pid.act())
+        if terminated or truncated:
+            break
+    assert info["is_success"]
+    x, y, z = np.array(path).T
+    over = np.hypot(x - env.unwrapped.cube[0], y - env.unwrapped.cube[1]) < 0.06
+    assert over.any() and z[over].min() > 0.42 + 0.1
+    risen = np.argmax(z > 0.42 + 0.1)
+    assert abs(np.arctan2(y, x)[:risen]).max() < 0.3 * 0.7  # of the way round
+    assert z.max() < 0.42 + 0.18 + 0.05 and z[-1] < 0.42 + 0.05
+
+
+@pytest.mark.parametrize("stage, trials", [
+    ("demo", (33, 104, 577, 805)), ("test", (4, 186, 371, 450, 720, 990)),  # where the cube is hard to get past
+])  # fmt: skip
+def test_way_over_the_cube_is_found_from_beside_it_and_to_goals_beside_it(make, stage, trials):
+    env = make("p2po", stage=stage)
+    pid = PID(env, "fast")
+    for trial in trials:
+        env.reset(seed=(1_010_000 if stage == "test" else 2_010_000) + trial)
+        while True:
+            _, _, terminated, truncated, info = env.step(pid.act())
+            if terminated or truncated:
+                break
+        assert info["is_success"], trial
+
+
+def test_arm_is_where_its_forward_kinematics_put_it():
+    q = np.random.default_rng(0).uniform(-1, 1, (50, 4)) * (0, 2.4, 2.6, 2.2)
+    r, z = pid_demo.arm(q[:, 1:])
+    ends = np.array([tcp(one) for one in q])
+    hand = np.stack([r[:, 3] - r[:, 2], z[:, 3] - z[:, 2]]) / (kinova_env.HAND + pid_demo.FINGERS)
+    np.testing.assert_allclose(r[:, 3] - pid_demo.FINGERS * hand[0], ends[:, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(z[:, 3] - pid_demo.FINGERS * hand[1], ends[:, 2], rtol=0, atol=1e-12)
 
 
 # ---- the recorded arrays ---------------------------------------------------------------------------------------------
@@ -453,42 +514,6 @@ def test_command_line_records_and_exits_0_and_says_what_is_wrong_with_2(tmp_path
     lines = [line for line in done.stderr.splitlines() if not line.startswith("pybullet build time")]
     assert done.returncode == 2 and done.stdout == ""
     assert len(lines) == 1 and "--K_P" in lines[0]
-
-
-@pytest.mark.parametrize("task", ["p2po", "pnp"])
-def test_way_past_or_to_the_cube_depends_on_the_state_alone_not_on_what_was_reached_before(make, task):
-    env = make(task, stage="test")
-    pid, compared = PID(env, "fast"), 0
-    rng = np.random.default_rng(0)
-    for seed in range(4):
-        env.reset(seed=seed)
-        for _ in range(150):
-            a = pid.act()
-            if not env.unwrapped.grasped:
-                assert np.array_equal(PID(env, "fast").act(), a)
-                compared += 1
-            if env.step(np.clip(a + 0.3 * rng.standard_normal(4), -1, 1).astype(np.float32))[2]:
-                break
-    assert compared > 200
-
-
-def test_way_over_the_cube_rises_before_it_crosses_and_crosses_before_it_descends(make):
-    env = make("p2po")
-    start, goal, cube = (0.0, 0.52, 0.42), (-0.7, 0.5, 0.4), (-0.35, 0.5, 0.42)
-    env.reset(seed=0, options={"start": start, "goal": goal, "object": cube})
-    pid, path = PID(env, "fast"), []
-    for _ in range(400):
-        path.append(env.unwrapped.tcp)
-        _, _, terminated, truncated, info = env.step(pid.act())
-        if terminated or truncated:
-            break
-    assert info["is_success"]
-    x, y, z = np.array(path).T
-    over = np.hypot(x - env.unwrapped.cube[0], y - env.unwrapped.cube[1]) < 0.06
-    assert over.any() and z[over].min() > 0.42 + 0.1
-    risen = np.argmax(z > 0.42 + 0.1)
-    assert abs(np.arctan2(y, x)[:risen]).max() < 0.3 * 0.7  # of the way round
-    assert z.max() < 0.42 + 0.18 + 0.05 and z[-1] < 0.42 + 0.05
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------
