@@ -65,8 +65,8 @@ class PID:
         self._episode = None
 
     def _clearest(self, found, beside):
-        """Of postures (M, 4) the one nearest to the present, those left out that come nearer than `clearance` to the
-        cube as it lies `beside` rad from the arm's plane; where all do, the one that does least."""
+        """Of postures (M, 4) the one nearest to the present of those that keep `clearance` from the cube, which lies
+        `beside` rad from the arm's plane; where none does, the one that comes least too near."""
         q, (x, y, z_o), (r, z) = np.array(self.env.q), self.env.cube, arm(found[:, 1:])
         rho = math.hypot(x, y)
         dr, dz = np.diff(r), np.diff(z)
@@ -90,6 +90,7 @@ class PID:
         azimuth, of_goal, of_cube = (math.atan2(place[1], place[0]) for place in places)
         turn, beside = wrap(of_goal - azimuth), wrap(of_cube - azimuth)
 
+        # near the goal, and no longer over the cube: from 0.55 to 0.8 of the way from it to the goal, or to 0.16 m
         descend = np.clip(min(2 - to_goal / BLEND, (to_cube / min(apart, 0.16) - 0.55) / 0.25), 0, 1)
         height = z_g + max(0, z_o + ABOVE - z_g) * (1 - descend)
         found = postures((x_g, y_g, height))
@@ -97,7 +98,7 @@ class PID:
         nearest = 0 if passes else min(abs(beside), abs(wrap(beside - turn)))  # that the turn brings it to the cube
         cross = self._clearest(found if len(found) else postures(self.env.goal), nearest)
 
-        close = np.clip((ASIDE - 0.01 - to_cube) / 0.05, 0, 1)
+        close = np.clip((ASIDE - 0.01 - to_cube) / 0.05, 0, 1)  # 1: turns away only; 0: rises only
         away = max(0, math.asin(min(1, ASIDE / math.hypot(x_o, y_o))) - abs(beside)) * (close > 0)
         rise = z + (height - z) * (1 - close)
         found = postures(kinova_env.cartesian(azimuth - math.copysign(away, beside), math.hypot(x, y), rise))
