@@ -22,20 +22,6 @@ PI = math.pi
 STILL = (0.0, 0.0, 0.0)  # gains of a controller that never moves: every episode fails
 
 
-@pytest.fixture
-def make():
-    """gymnasium.make by the task's short name; closed at the end of the test."""
-    opened = []
-
-    def make_(task="p2p", **settings):
-        opened.append(gymnasium.make(TASKS[task].env_id, disable_env_checker=True, **settings))
-        return opened[-1]
-
-    yield make_
-    for env in opened:
-        env.close()
-
-
 def set_point(env, gain=0.1):
     """Joint set point of a P controller from its action: q + a / K_P, the gain small enough never to saturate."""
     return env.unwrapped.q + PID(env, (gain, 0.0, 0.0)).act().astype(float) / gain
