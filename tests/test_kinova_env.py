@@ -228,8 +228,7 @@ def test_start_and_goal_of_demonstrations_follow_the_table_for_every_number_of_p
     centre = (partitions - (0.5 if task == "p2p" else 0)) * 2 * PI / K
     mean = np.array([start_posture(theta, 0.52, 0.42) for theta in centre])
     jitter = wrap(part(obs, "q") - mean).T
-    for of_joint in jitter:
-        assert_fills(of_joint, -0.02, 0.02)
+    assert_fills(jitter, -0.02, 0.02)
     assert np.abs(np.corrcoef(jitter) - np.eye(4)).max() < 0.3  # each joint by itself
     goals = np.array([cylinder(goal) for goal in part(obs, "P_g")])
     assert_fills(wrap(goals[:, 0] - centre), -PI / K, PI / K if task == "p2p" else 0)
