@@ -38,7 +38,7 @@ class Flags(logx.RunFlags):
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
-    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: canonical", ("none", "gas", "so2", "canonical"))
+    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: cylinder", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
@@ -84,7 +84,7 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
 PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
              normalize_obs=False, hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False,
              clip_target=False, lr_decay=False)  # fmt: skip
-ROBUST = dict(symmetry="canonical", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
+ROBUST = dict(symmetry="cylinder", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
               normalize_obs=True, hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True,
               clip_target=True, lr_decay=True, start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
@@ -126,8 +126,7 @@ class ReplayBuffer:
 
     def store(self, s, a, r, s2, discount):
         """s, s2 (obs_dim,), a (4,), float32; r, discount numbers."""
-        if self.symmetry == "canonical":
-            s, s2 = gas.canonical(s), gas.canonical(s2)
+        s, s2 = gas.seen(s, self.symmetry), gas.seen(s2, self.symmetry)
         row = np.concatenate((s, a, (r,), s2, (discount,)), dtype=np.float32, casting="same_kind")
         self.rows[self.next] = torch.from_numpy(row)
         self.next, self.filled = (self.next + 1) % len(self.rows), min(self.filled + 1, len(self.rows))
@@ -282,7 +281,7 @@ class Learner:
     @torch.inference_mode()
     def act(self, s):
         """pi_mu of one observation of the environment: (4,) numpy."""
-        s = gas.canonical(s) if self.flags.symmetry == "canonical" else s
+        s = gas.seen(s, self.flags.symmetry)
         return self.net.pi(torch.from_numpy(s).to(self.flags.device)).cpu().numpy()
 
     def updates(self, B_o, B_d, n):

@@ -85,7 +85,7 @@ class Policy:
         import torch  # here and below: seconds, which tables and figures are spared
 
         self.task = stored["task"]
-        self.canonical = stored["symmetry"] == "canonical"
+        self.symmetry = stored["symmetry"]
         self.grasp_input = bool(stored.get("grasp_input"))
         sizes = stored["sizes"]
         if (sizes[0] - self.grasp_input, sizes[-1]) != (OBS_DIM[self.task], 4):
@@ -101,7 +101,7 @@ class Policy:
     def __call__(self, obs):
         import torch
 
-        s = gas.canonical(obs) if self.canonical else obs
+        s = gas.seen(obs, self.symmetry)
         if self.grasp_input:
             s = np.concatenate((s, np.float32(grasped(s))[..., None]), axis=-1)
         with torch.inference_mode():

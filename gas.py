@@ -4,6 +4,8 @@
     psi(action, k, K=4)   the action map: the identity, joint velocities stay     (Sec. 3.1)
     rotate(obs, angle)    the state map at any angle: the symmetry does not stop at K
     canonical(obs)        the world turned so that q_1 = 0: the state in the arm's own frame
+    cylinder(obs)         the same frame, in the cylinder coordinates of Eq. 10
+    seen(obs, symmetry)   the state as networks see it under --symmetry
     partition_of(obs, K)  which sector S_k the TCP is in                          (Definition 2)
     aggregate(demos, K)   one partition's demonstrations, turned into all K       (Sec. 3.2)
 
@@ -17,6 +19,8 @@ import math
 import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
+
+SYMMETRIES = ("none", "gas", "so2", "canonical", "cylinder")  # of --symmetry
 
 # By observation width, 22 or 25: {how it rotates: [first index, ...]} and the row of a task of that width.
 _ROTATES, _TASK = {}, {}
@@ -81,6 +85,36 @@ def canonical(obs):
     out[..., index["sine"][0]] = 0.0
     out[..., index["cosine"][0]] = 1.0
     return out
+
+
+def cylinder(obs):
+    """The state in the arm's own frame and in cylinder coordinates (rho, theta, z), as Eq. 10 draws goals.
+
+    obs: (..., 22 or 25). P_g and P_o become (rho, theta, z), theta in rad from the arm's plane, and e becomes
+    (rho_g - rho_e, theta_g - theta_e, z_g - z_e), the angle in [-pi, pi). The same for every turned world, like
+    `canonical`; unlike there, how far the arm has to turn stands in one entry and changes no other, so that a network
+    which has seen a few of these angles can act well at all of them.
+    """
+    xp, out, index = _library(obs)
+    q1 = index["angle"][0]
+    i_g, i_e, *i_o = index["vector"]
+    x_e, y_e = obs[..., i_g] - obs[..., i_e], obs[..., i_g + 1] - obs[..., i_e + 1]
+    theta_e = xp.arctan2(y_e, x_e)
+    from_plane = wrap(theta_e + obs[..., q1])  # of the TCP: joint 1 points down
+    for i in (i_g, *i_o):
+        x, y = obs[..., i], obs[..., i + 1]
+        turn = wrap(xp.arctan2(y, x) - theta_e)
+        out[..., i], out[..., i + 1] = xp.hypot(x, y), from_plane + turn
+        if i == i_g:
+            out[..., i_e], out[..., i_e + 1] = xp.hypot(x, y) - xp.hypot(x_e, y_e), turn
+    for name, value in (("angle", 0.0), ("sine", 0.0), ("cosine", 1.0)):
+        out[..., index[name][0]] = value
+    return out
+
+
+def seen(obs, symmetry):
+    """The state as networks see it under --symmetry: (..., 22 or 25), of `none`, `gas` and `so2` as it is."""
+    return {"canonical": canonical, "cylinder": cylinder}.get(symmetry, lambda s: s)(obs)
 
 
 def partition_of(obs, K=4):

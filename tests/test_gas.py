@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import gas
+import kinova_env
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, KinovaEnv, tcp, wrap
 from pid_demo import PID, record
 
@@ -138,7 +139,7 @@ def test_what_rotates_is_what_the_observation_layout_says(task):
     assert {rotates for *_, rotates in OBSERVATION[task]} == {"angle", "sine", "cosine", "", "vector"}
 
 
-@pytest.mark.parametrize("use", [lambda obs: gas.phi(obs, 0), gas.canonical, gas.partition_of])
+@pytest.mark.parametrize("use", [lambda obs: gas.phi(obs, 0), gas.canonical, gas.cylinder, gas.partition_of])
 def test_width_is_what_decides_and_any_other_is_a_value_error(use):
     for wrong in (np.zeros((3, 24)), torch.zeros(3, 4)):
         with pytest.raises(ValueError, match=f"width {wrong.shape[-1]}"):
@@ -186,6 +187,7 @@ MAPS = {
     "phi": lambda obs: gas.phi(obs, 3),
     "phi of 5": lambda obs: gas.phi(obs, 2, 5),
     "canonical": gas.canonical,
+    "cylinder": gas.cylinder,
 }
 
 
@@ -243,6 +245,52 @@ def test_canonical_has_no_base_angle_is_idempotent_and_the_same_for_every_rotate
     assert difference(gas.canonical(gas.rotate(obs, np.linspace(-PI, PI, 50))), out) < 1e-12
     # it is a rotation: nothing else is lost
     assert difference(gas.rotate(out, -obs[:, 0]), obs) < 1e-12
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_cylinder_is_the_same_for_every_rotated_world_and_loses_nothing_else(task):
+    obs = states(OBS_DIM[task])
+    own, out = gas.canonical(obs), gas.cylinder(obs)
+    for angle in ANGLES:
+        turned_world = gas.cylinder(gas.rotate(obs, angle)) - out
+        assert np.abs(np.where(np.abs(turned_world) > 6, np.abs(turned_world) - 2 * PI, turned_world)).max() < 1e-12
+    P_g, e = INDEX[task]["P_g"], INDEX[task]["e"]
+    assert np.array_equal(out[:, :16], own[:, :16])  # the joints as in `canonical`
+
+    def place(rho_theta_z):
+        rho, theta, z = rho_theta_z.T
+        return np.stack([rho * np.cos(theta), rho * np.sin(theta), z], axis=1)
+
+    assert difference(place(out[:, P_g]), own[:, P_g]) < 1e-12
+    assert difference(place(out[:, P_g] - out[:, e]), own[:, P_g] - own[:, e]) < 1e-12  # P_e
+    for P_o in [where for name, where in INDEX[task].items() if name == "P_o"]:
+        assert difference(place(out[:, P_o]), own[:, P_o]) < 1e-12
+    assert np.all(np.abs(out[:, e][:, 1]) <= PI)
+
+
+def test_a_turn_of_the_goal_changes_two_entries_of_cylinder():
+    env = KinovaEnv("p2p")
+    seen = [gas.cylinder(env.reset(options={"goal": (math.pi / 4 + turn, 0.5, 0.4)})[0]) for turn in (0.3, 1.0, 2.8)]
+    env.close()
+    theta_g, theta_e = INDEX["p2p"]["P_g"].start + 1, INDEX["p2p"]["e"].start + 1
+    for after, turn in zip(seen[1:], (0.7, 2.5), strict=True):
+        expected = seen[0].copy()
+        expected[[theta_g, theta_e]] += turn
+        assert difference(after, expected) < 1e-6
+
+
+def test_grasped_sees_the_same_in_every_view():
+    obs, *_ = rollout("pnp", [None] * 200, {})
+    assert 0 < kinova_env.grasped(obs.astype(np.float32)).mean() < 1
+    for view in ("canonical", "cylinder"):
+        assert np.array_equal(kinova_env.grasped(gas.seen(obs.astype(np.float32), view)), kinova_env.grasped(obs))
+
+
+def test_seen_is_the_state_itself_but_for_the_arms_own_frame():
+    obs = states(25)
+    for symmetry in gas.SYMMETRIES:
+        own = {"canonical": gas.canonical, "cylinder": gas.cylinder}.get(symmetry)
+        assert np.array_equal(gas.seen(obs, symmetry), own(obs) if own else obs)
 
 
 def test_goal_minus_error_turns_as_the_tcp_does_and_is_the_tcp_of_the_rotated_joints():
