@@ -38,7 +38,7 @@ class Flags(logx.RunFlags):
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
-    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: cylinder", gas.SYMMETRIES)
+    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
@@ -56,7 +56,7 @@ class Flags(logx.RunFlags):
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
     act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
-    polyak: float | None = flag(None, "omega, target update coefficient; 0.995, robust: 0.98", low=0, high=1)
+    polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu", low=0)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
@@ -67,13 +67,11 @@ class Flags(logx.RunFlags):
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of actor, then critic, before the first step; 0, robust: 2500", low=0)
+    keep_clone: bool | None = flag(None, "L_BC holds own states too, with the first clone's actions, M = 1")
     normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of B_d")
     hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
-    critics: int | None = flag(None, "of which the smallest value counts; 1, robust: 2", low=1, high=2)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
-    clip_target: bool | None = flag(None, "clip targets to the range of possible returns")
-    lr_decay: bool | None = flag(None, "both learning rates fall linearly to 0 over the second half of the run")
 
 
 TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5; epochs of pnp: ours
@@ -81,32 +79,34 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "p2po": dict(epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
-PAPER = dict(symmetry="gas", gains="authors", polyak=0.995, pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0,
-             normalize_obs=False, hindsight=0, critics=1, updates_per_step=1.0, critic_layernorm=False,
-             clip_target=False, lr_decay=False)  # fmt: skip
-ROBUST = dict(symmetry="cylinder", gains="fast", polyak=0.98, pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500,
-              normalize_obs=True, hindsight=2, critics=2, updates_per_step=0.25, critic_layernorm=True,
-              clip_target=True, lr_decay=True, start_steps=0)  # fmt: skip
+PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=False,
+             normalize_obs=False, hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500, keep_clone=True,
+              normalize_obs=True, hindsight=2, updates_per_step=0.25, critic_layernorm=True,
+              start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
 
 
-def recipe_defaults(task, recipe, max_ep_len=None):
+def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
     """{flag: value} of all that task and recipe decide."""
     T = max_ep_len or TASKS[task].horizon
     defaults = TASK_DEFAULTS[task] | dict(max_ep_len=TASKS[task].horizon, steps_per_epoch=5 * T)
     defaults |= dict(update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
-    return defaults | (PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task])
+    defaults |= PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task]
+    return defaults | ({"keep_clone": False} if clone_iters == 0 else {})
 
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
     flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
-    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len), "ddpg")
+    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp, where a grasp has no goal")
     if flags.clone_iters and not flags.demos_in_B_o:
         raise logx.BadInput(f"--clone_iters {flags.clone_iters}: needs demonstrations in B_o, else 0 is allowed")
+    if flags.keep_clone and not flags.clone_iters:
+        raise logx.BadInput("--keep_clone: there is no clone at --clone_iters 0; allowed from 1 on")
     return flags
 
 
@@ -116,7 +116,8 @@ def resolve(flags):
 class ReplayBuffer:
     """Transitions (s, a, r, s', discount) in a ring; the value of s' counts for discount = gamma^n (1 - zeta).
 
-    Here the symmetry meets the data: `canonical` turns each state as it is stored, `so2` each sample by a random angle.
+    Here the symmetry meets the data: `gas.seen` turns each state as it is stored; of a sample, `so2` turns each row by
+    a random angle, `mirror` exchanges left and right in every other.
     """
 
     def __init__(self, obs_dim, size, symmetry):
@@ -138,6 +139,10 @@ class ReplayBuffer:
         if self.symmetry == "so2":
             angle = 2 * math.pi * torch.rand(len(i))
             s, s2 = gas.rotate(s, angle), gas.rotate(s2, angle)  # psi is the identity: a stays
+        if self.symmetry == "mirror":
+            half = slice(None, None, 2)  # rows are drawn at random: this half of them is a random one
+            s2[half], _ = gas.mirror(s2[half], a[half])
+            s[half], a[half] = gas.mirror(s[half], a[half])
         return [x.to(device) for x in (s, a, r.squeeze(1), s2, discount.squeeze(1))]
 
     def state(self):
@@ -202,10 +207,10 @@ def mlp(sizes, layernorm=False):
 class ActorCritic(nn.Module):
     """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R, on (s - s_mean) / s_std."""
 
-    def __init__(self, obs_dim, hidden_sizes, critics, critic_layernorm):
+    def __init__(self, obs_dim, hidden_sizes, critic_layernorm):
         super().__init__()
         self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
-        self.q_nets = nn.ModuleList(mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm) for _ in range(critics))
+        self.q_net = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
         self.register_buffer("s_mean", torch.zeros(obs_dim))
         self.register_buffer("s_std", torch.ones(obs_dim))
 
@@ -220,14 +225,9 @@ class ActorCritic(nn.Module):
         """pi_mu(s) of s (n, obs_dim): (n, 4)."""
         return torch.tanh(self.u(s))
 
-    def Qs(self, s, a, first=None):
-        """Each of the (first) critics' value of s (n, obs_dim), a (n, 4): (critics, n)."""
-        x = torch.cat((self.inputs(s), a), dim=-1)
-        return torch.stack([q(x).squeeze(-1) for q in self.q_nets[:first]])
-
     def Q(self, s, a):
-        """Q_nu: the smallest of the critics' values (TD3, Fujimoto et al. 2018). (n,)."""
-        return self.Qs(s, a).amin(0)
+        """Q_nu of s (n, obs_dim), a (n, 4): (n,)."""
+        return self.q_net(torch.cat((self.inputs(s), a), dim=-1)).squeeze(-1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -235,8 +235,8 @@ class ActorCritic(nn.Module):
 
 
 def loss_C(Q_s_a, y):
-    """Alg. 1, with the stored action a_t where it prints pi(s_t). Q_s_a: (critics, n)."""
-    return ((Q_s_a - y) ** 2).mean(-1).sum()
+    """Alg. 1, with the stored action a_t where it prints pi(s_t)."""
+    return ((Q_s_a - y) ** 2).mean()
 
 
 def loss_O(Q_s_pi):
@@ -270,13 +270,13 @@ class Learner:
 
     def __init__(self, flags):
         f = self.flags = flags
-        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.critics, f.critic_layernorm).to(f.device)
+        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.critic_layernorm).to(f.device)
         self.target = deepcopy(self.net).requires_grad_(False)
-        self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_nets.parameters())
+        self.clone_net = deepcopy(self.net.mu_net).requires_grad_(False)  # stays as it is after clone()
+        self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_net.parameters())
         groups = dict(params=self.mu, lr=f.pi_lr), dict(params=self.nu, lr=f.q_lr)
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.move_targets = get_ema_multi_avg_fn(f.polyak)
-        self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     @torch.inference_mode()
     def act(self, s):
@@ -290,34 +290,41 @@ class Learner:
             measured = self.update(B_o, B_d)
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
-    def update(self, B_o, B_d, hold_actor=False):
-        """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
-        f, net, target = self.flags, self.net, self.target
-        s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
+    def critic_loss(self, s, a, r, s2, discount):
+        """(L_C, Q_nu(s, a)) of a batch of B_o."""
         with torch.no_grad():  # y is a constant: no gradient through the targets
-            y = r + discount * target.Q(s2, target.pi(s2))
-            if f.clip_target:
-                y = y.clamp(*self.return_range)
-        Q = net.Qs(s, a)
-        L_C = loss_C(Q, y)
+            y = r + discount * self.target.Q(s2, self.target.pi(s2))
+        Q = self.net.Q(s, a)
+        return loss_C(Q, y), Q
+
+    def step(self):
+        self.optimizer.step()
+        # mu' <- omega mu' + (1 - omega) mu, and nu' alike
+        self.move_targets(list(self.target.parameters()), list(self.net.parameters()), None)
+
+    def update(self, B_o, B_d):
+        """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
+        f, net = self.flags, self.net
+        s, a, *rest = B_o.sample(f.batch_size, f.device)
+        L_C, Q = self.critic_loss(s, a, *rest)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
         u, u_demo = net.u(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
-        a_hat = torch.tanh(u_demo)
-        L_O = loss_O(net.Qs(s, torch.tanh(u), first=1))  # of two critics the first alone (TD3)
+        a_own, a_hat = torch.tanh(u), torch.tanh(u_demo)
+        L_O = loss_O(net.Q(s, a_own))
         with torch.no_grad():
             Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat)
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
+        if f.keep_clone and B_d:
+            a_clone = torch.tanh(self.clone_net(net.inputs(s)))
+            L_BC = L_BC + loss_BC(a_clone, a_own, torch.ones_like(Q))
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
         L_C.backward()
-        if not hold_actor:
-            L_A.backward(inputs=self.mu)
-        self.optimizer.step()
-        # mu' <- omega mu' + (1 - omega) mu, and nu' alike
-        self.move_targets(list(self.target.parameters()), list(self.net.parameters()), None)
+        L_A.backward(inputs=self.mu)
+        self.step()
         return [x.detach() for x in (
             L_O, L_BC, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
             # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
@@ -339,11 +346,15 @@ class Learner:
             L_BC.backward()
             self.optimizer.step()
         self.target.load_state_dict(net.state_dict())
+        self.clone_net.load_state_dict(net.mu_net.state_dict())
         for _ in trange(f.clone_iters, desc="critic following", disable=f.quiet or None):
-            self.update(B_o, B_d, hold_actor=True)
+            L_C, _ = self.critic_loss(*B_o.sample(f.batch_size, f.device))
+            self.optimizer.zero_grad()
+            L_C.backward()
+            self.step()
 
     def state(self):
-        return {name: getattr(self, name).state_dict() for name in ("net", "target", "optimizer")}
+        return {name: getattr(self, name).state_dict() for name in ("net", "target", "clone_net", "optimizer")}
 
     def load(self, state):
         for name, part in state.items():
@@ -363,7 +374,7 @@ def train(flags):
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)
-    with logx.RunFolder(flags, "ddpg", MEASURED, fixed_length=flags.lr_decay) as run:
+    with logx.RunFolder(flags, "ddpg", MEASURED) as run:
         if not run.finished():
             loop(flags, run)
     return run.folder
@@ -420,9 +431,6 @@ def loop(f, run):
 
         # update
         if t >= f.update_after and t % f.update_every == 0 and B_o.filled:
-            if f.lr_decay:
-                for group, lr in zip(learner.optimizer.param_groups, (f.pi_lr, f.q_lr), strict=True):
-                    group["lr"] = lr * min(1.0, 2 * (1 - t / run.total_steps))  # 1 over the first half
             n = math.floor(f.updates_per_step * t) - math.floor(f.updates_per_step * (t - f.update_every))
             if n:
                 run.log_updates(learner.updates(B_o, B_d, n), learner.net)

@@ -5,6 +5,7 @@
     rotate(obs, angle)    the state map at any angle: the symmetry does not stop at K
     canonical(obs)        the world turned so that q_1 = 0: the state in the arm's own frame
     cylinder(obs)         the same frame, in the cylinder coordinates of Eq. 10
+    mirror(obs, action)   left and right exchanged, in any of these frames
     seen(obs, symmetry)   the state as networks see it under --symmetry
     partition_of(obs, K)  which sector S_k the TCP is in                          (Definition 2)
     aggregate(demos, K)   one partition's demonstrations, turned into all K       (Sec. 3.2)
@@ -20,7 +21,7 @@ import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-SYMMETRIES = ("none", "gas", "so2", "canonical", "cylinder")  # of --symmetry
+SYMMETRIES = ("none", "gas", "so2", "canonical", "cylinder", "mirror")  # of --symmetry
 
 # By observation width, 22 or 25: {how it rotates: [first index, ...]} and the row of a task of that width.
 _ROTATES, _TASK = {}, {}
@@ -112,9 +113,25 @@ def cylinder(obs):
     return out
 
 
+def mirror(obs, action):
+    """State and action with left and right exchanged: reflected in the arm's plane, or in the world's x-z plane where
+    the state is of the world.
+
+    obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Not
+    exact, but to 1 mm: the TCP lies 1.35 mm beside the arm's plane (kinova_env.SIDE).
+    """
+    _, out, index = _library(obs)
+    first = [index[name][0] for name in ("angle", "sine", "")]  # q_1, sin q_1, dq_1/dt
+    for i in first + [start + 1 for start in index["vector"]]:  # and y or theta
+        out[..., i] = -out[..., i]
+    action = action.copy() if isinstance(action, np.ndarray) else action.clone()
+    action[..., 0] = -action[..., 0]
+    return out, action
+
+
 def seen(obs, symmetry):
     """The state as networks see it under --symmetry: (..., 22 or 25), of `none`, `gas` and `so2` as it is."""
-    return {"canonical": canonical, "cylinder": cylinder}.get(symmetry, lambda s: s)(obs)
+    return {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}.get(symmetry, lambda s: s)(obs)
 
 
 def partition_of(obs, K=4):

@@ -347,16 +347,15 @@ class RunFolder:
     """One run's folder, held by this process until the `with` block ends; `checkpoint` is None or what was saved.
 
     flags: of an algorithm script; measured: the names of what `log_updates` is given, which become columns of
-    progress.csv; fixed_length: a resume may not change --epochs, since something falls over the run's length. Raises
-    BadInput for whatever is wrong with the folder, another process that holds it included.
+    progress.csv. Raises BadInput for whatever is wrong with the folder, another process that holds it included.
     """
 
-    def __init__(self, flags, algo, measured, fixed_length=False):
+    def __init__(self, flags, algo, measured):
         self.flags, self.folder = flags, Path(flags.data_dir) / flags.name
         self.total_steps = flags.epochs * flags.steps_per_epoch
         self.columns = {"episodes": EPISODES, "progress": [*PROGRESS, *measured, *EVALUATED]}
         self._config = dataclasses.asdict(flags) | {"algo": algo, "resume": bool(flags.resume)}
-        self._fixed_length, self._files, self._board, self._bar = fixed_length, {}, None, None
+        self._files, self._board, self._bar = {}, None, None
         self.stop_signals = []
         self._log = {"episodes": 0, "epoch_episodes": [], "epoch_updates": [], "demo_env_steps": 0}
         if flags.tensorboard:
@@ -411,9 +410,6 @@ class RunFolder:
         for key in sorted(set(now) | set(before)):
             if key not in free and now.get(key) != before.get(key):
                 raise BadInput(f"{path}: made with --{key} {before.get(key)}, not {now.get(key)}")
-        if self._fixed_length and now["epochs"] != before["epochs"]:
-            raise BadInput(f"{path}: made with --epochs {before['epochs']}, not {now['epochs']}, and learning rates "
-                           "that fall over its length; begin a new --name")  # fmt: skip
         path = self.folder / "config.json"
         try:
             self._recorded = json.loads(path.read_text())

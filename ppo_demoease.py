@@ -39,7 +39,7 @@ class Flags(logx.RunFlags):
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
     num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
-    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: cylinder", gas.SYMMETRIES)
+    symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
@@ -81,7 +81,7 @@ TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
 PAPER = dict(epochs=50, symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, pi_lr=3e-4, log_std=-0.5,
              mask="reward", demos_in_B_o=True, demo_noise=0.0, clone_iters=0, after_kl="none", normalize_obs=False,
              grasp_input=False, clip_value=False)  # fmt: skip
-ROBUST = dict(epochs=50, symmetry="cylinder", gains="fast", train_iters=80, demo_batch_size=256, pi_lr=3e-6,
+ROBUST = dict(epochs=50, symmetry="mirror", gains="fast", train_iters=80, demo_batch_size=256, pi_lr=3e-6,
               log_std=-2.0, mask="none", demos_in_B_o=False, demo_noise=0.2, clone_iters=4000, after_kl="critic",
               normalize_obs=True, grasp_input=True, clip_value=True)  # fmt: skip
 
@@ -276,6 +276,9 @@ class Learner:
         i = torch.randint(B_d.filled, (min(self.flags.demo_batch_size, B_d.filled),))
         angle = 2 * math.pi * torch.rand(len(i)) if self.flags.symmetry == "so2" else None
         s, a, r, *_ = B_d.columns(i, angle)
+        if self.flags.symmetry == "mirror":
+            half = slice(None, None, 2)  # rows are drawn at random: this half of them is a random one
+            s[half], a[half] = gas.mirror(s[half], a[half])
         return [x.to(self.flags.device) for x in (s, a, r, R_demo[i])]
 
     def clone(self, B_d, R_demo):

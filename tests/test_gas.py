@@ -286,10 +286,36 @@ def test_grasped_sees_the_same_in_every_view():
         assert np.array_equal(kinova_env.grasped(gas.seen(obs.astype(np.float32), view)), kinova_env.grasped(obs))
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_mirrored_actions_lead_through_mirrored_states_to_a_millimetre(task):
+    options = {"start": (0.9, 0.52, 0.42), "goal": (1.9, 0.45, 0.5)} | ({"object": (2.2, 0.55, 0.45)} if task in CUBES
+                                                                        else {})  # fmt: skip
+    obs, act, *_ = rollout(task, [None] * 300, options)
+    assert len(act) > 40 and np.ptp(obs[:, 0]) > 0.5
+    mirrored, mirrored_act = gas.mirror(obs[:-1], act)
+    other, *_ = rollout(task, mirrored_act, {name: (-theta, *rest) for name, (theta, *rest) in options.items()})
+    n = min(len(other), len(mirrored))
+    assert n > len(act) - 3
+    start = INDEX[task]["P_g"].start
+    np.testing.assert_allclose(other[:n, start:], mirrored[:n, start:], rtol=0, atol=0.0015)
+    assert difference(other[:n, start:], obs[:n, start:]) > 0.5
+
+
+@pytest.mark.parametrize("width", [22, 25])
+def test_mirror_is_its_own_inverse_and_reflects_in_every_frame(width):
+    obs, act = states(width), np.random.default_rng(0).uniform(-1, 1, (50, 4))
+    for s, a in ((obs, act), (torch.from_numpy(obs), torch.from_numpy(act))):
+        there, back = gas.mirror(s, a), gas.mirror(*gas.mirror(s, a))
+        assert difference(np.asarray(back[0]), obs) == 0 and difference(np.asarray(back[1]), act) == 0
+        assert np.array_equal(np.asarray(there[1]), act * (-1, 1, 1, 1)) and type(there[0]) is type(s)
+        for frame in (gas.canonical, gas.cylinder):
+            assert difference(np.asarray(frame(there[0])), np.asarray(gas.mirror(frame(s), a)[0])) < 1e-12
+
+
 def test_seen_is_the_state_itself_but_for_the_arms_own_frame():
     obs = states(25)
     for symmetry in gas.SYMMETRIES:
-        own = {"canonical": gas.canonical, "cylinder": gas.cylinder}.get(symmetry)
+        own = {"canonical": gas.canonical, "cylinder": gas.cylinder, "mirror": gas.cylinder}.get(symmetry)
         assert np.array_equal(gas.seen(obs, symmetry), own(obs) if own else obs)
 
 

@@ -48,11 +48,11 @@ def parse(*argv):
     return logx.parse_flags(Kinds, "What it does.", list(argv))
 
 
-def folder_of(path, fixed_length=False, algo="ddpg", **changes):
+def folder_of(path, algo="ddpg", **changes):
     """A run's folder as a script takes it: path is DATA_DIR/NAME."""
     flags = Flags(epochs=4, steps_per_epoch=50, hidden_sizes=(16, 16), name=path.name, quiet=True)
     flags = replace(flags, data_dir=str(path.parent), **changes)
-    return logx.RunFolder(flags, algo, MEASURED, fixed_length)
+    return logx.RunFolder(flags, algo, MEASURED)
 
 
 def log_episode(run, t, success=False):
@@ -465,14 +465,13 @@ def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path):
 @pytest.mark.parametrize("changes, says", [
     (dict(gamma=0.9), "made with --gamma 0.99, not 0.9"), (dict(hidden_sizes=(16, 8)), "made with --hidden_sizes"),
     (dict(algo="ppo"), "a run of ddpg, not of ppo"),
-    (dict(fixed_length=True, epochs=9), "made with --epochs 4, not 9, and learning rates that fall over its length"),
 ])  # fmt: skip
 def test_a_checkpoint_goes_on_only_as_the_run_it_was_made_by(stopped, changes, says):
     before = contents(stopped)
     with pytest.raises(BadInput, match=f"--resume: .*checkpoint.pt: {says}"):
         folder_of(stopped, resume=True, **changes)
     assert contents(stopped) == before
-    with folder_of(stopped, resume=True, fixed_length=True, quiet=False):  # and is let go
+    with folder_of(stopped, resume=True, quiet=False):  # and is let go
         pass
 
 

@@ -495,9 +495,9 @@ def demo_rows():
     return torch.from_numpy(np.array(rows).astype(np.float32))
 
 
-@pytest.mark.parametrize("symmetry", ["none", "so2", "canonical"])
+@pytest.mark.parametrize("symmetry", ["none", "so2", "canonical", "mirror"])
 def test_an_epoch_learns_from_its_own_steps_in_order_and_a_timeout_or_a_cut_is_no_true_end(symmetry, world, epochs):
-    run, view = world("a", symmetry=symmetry), gas.canonical if symmetry == "canonical" else lambda s: s
+    run, view = world("a", symmetry=symmetry), lambda s: gas.seen(s, symmetry)
     assert len(run.steps) == 120 and len(epochs) == 3
     for n, epoch in enumerate(epochs):
         assert torch.equal(epoch.B_o, transitions(run.steps[40 * n : 40 * (n + 1)], view)) and len(epoch.B_d) == 0

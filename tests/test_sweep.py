@@ -104,16 +104,16 @@ def test_grid_is_the_papers_20_configurations_and_p2ps_two_plain_ddpg_columns_sh
 
 @pytest.mark.parametrize("flags, names, total", [
     ("--task p2p --columns lambda=1.8", ["p2p-ddpg-paper-N100-lambda1.8-gas-seed0"], 500_000),
-    ("--task p2p --columns lambda=1.8 --recipe robust", ["p2p-ddpg-robust-N100-lambda1.8-canonical-seed0"], 25_000),
+    ("--task p2p --columns lambda=1.8 --recipe robust", ["p2p-ddpg-robust-N100-lambda1.8-mirror-seed0"], 25_000),
     ("--task p2p --columns lambda=1.8 --recipe robust --epochs 7",
-     ["p2p-ddpg-robust-N100-lambda1.8-canonical-epochs=7-seed0"], 7_000),
-    ("--task p2po --columns baseline --recipe robust", ["p2po-ddpg-robust-N0-lambda0-canonical-seed0"], 100_000),
-    ("--task pnp --columns lambda=15 --recipe robust", ["pnp-ppo-robust-N400-lambda15-canonical-seed0"], 200_000),
+     ["p2p-ddpg-robust-N100-lambda1.8-mirror-epochs=7-seed0"], 7_000),
+    ("--task p2po --columns baseline --recipe robust", ["p2po-ddpg-robust-N0-lambda0-mirror-seed0"], 100_000),
+    ("--task pnp --columns lambda=15 --recipe robust", ["pnp-ppo-robust-N400-lambda15-mirror-seed0"], 200_000),
     ("--task p2p --columns lambda=1.8 --vary symmetry=none,gas num_demos=4,8 --recipe robust",
      [f"p2p-ddpg-robust-N{N}-lambda1.8-{symmetry}-seed0" for symmetry in ("none", "gas") for N in (4, 8)], 25_000),
     ("--task p2p --columns lambda=1.8 --vary recipe=paper,robust gamma=0.9 steps_per_epoch=10 epochs=2",
      ["p2p-ddpg-paper-N100-lambda1.8-gas-steps_per_epoch=10-gamma=0.9-epochs=2-seed0",
-      "p2p-ddpg-robust-N100-lambda1.8-canonical-steps_per_epoch=10-gamma=0.9-epochs=2-seed0"], 20),
+      "p2p-ddpg-robust-N100-lambda1.8-mirror-steps_per_epoch=10-gamma=0.9-epochs=2-seed0"], 20),
 ])  # fmt: skip
 def test_folders_and_lengths_are_those_that_the_script_gives_by_itself(flags, names, total):
     jobs = jobs_of(*flags.split(), "--seeds", 1)
@@ -134,13 +134,13 @@ def test_columns_that_vary_makes_the_same_are_one_run():
 
 
 def test_varied_values_are_written_as_in_the_names_of_folders():
-    vary = ["hidden_sizes=64x32,8", "lr_decay=True,False", "timeout_ends=False,True"]
+    vary = ["hidden_sizes=64x32,8", "critic_layernorm=True,False", "timeout_ends=False,True"]
     jobs = jobs_of("--task", "p2p", "--columns", "baseline", "--vary", *vary, "--seeds", 1)
     assert len(jobs) == 8
-    assert " ".join(jobs[0].words).endswith("--hidden_sizes 64 32 --lr_decay --data_dir data/runs --seed 0")
+    assert " ".join(jobs[0].words).endswith("--hidden_sizes 64 32 --critic_layernorm --data_dir data/runs --seed 0")
     assert " ".join(jobs[7].words).endswith(
-        "--hidden_sizes 8 --no-lr_decay --timeout_ends --data_dir data/runs --seed 0")  # fmt: skip
-    assert "hidden_sizes=64x32-lr_decay=True" in jobs[0].folder.name
+        "--hidden_sizes 8 --no-critic_layernorm --timeout_ends --data_dir data/runs --seed 0")  # fmt: skip
+    assert "hidden_sizes=64x32-critic_layernorm=True" in jobs[0].folder.name
 
 
 @pytest.mark.parametrize("flags, says", [
