@@ -68,7 +68,6 @@ class Flags(logx.RunFlags):
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of actor, then critic, before the first step; 0, robust: 2500", low=0)
     keep_clone: bool | None = flag(None, "L_BC holds own states too, with the first clone's actions, M = 1")
-    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of B_d")
     hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
@@ -80,9 +79,9 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=False,
-             normalize_obs=False, hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
+             hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
 ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500, keep_clone=True,
-              normalize_obs=True, hindsight=2, updates_per_step=0.25, critic_layernorm=True,
+              hindsight=2, updates_per_step=0.25, critic_layernorm=True,
               start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
 
@@ -205,29 +204,20 @@ def mlp(sizes, layernorm=False):
 
 
 class ActorCritic(nn.Module):
-    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R, on (s - s_mean) / s_std."""
+    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R."""
 
     def __init__(self, obs_dim, hidden_sizes, critic_layernorm):
         super().__init__()
         self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
         self.q_net = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
-        self.register_buffer("s_mean", torch.zeros(obs_dim))
-        self.register_buffer("s_std", torch.ones(obs_dim))
-
-    def inputs(self, s):
-        return (s - self.s_mean) / self.s_std
-
-    def u(self, s):
-        """The action before its tanh, of s (n, obs_dim): (n, 4)."""
-        return self.mu_net(self.inputs(s))
 
     def pi(self, s):
-        """pi_mu(s) of s (n, obs_dim): (n, 4)."""
-        return torch.tanh(self.u(s))
+        """pi_mu(s) of s (n, obs_dim): (n, 4). mu_net gives the action before its tanh."""
+        return torch.tanh(self.mu_net(s))
 
     def Q(self, s, a):
         """Q_nu of s (n, obs_dim), a (n, 4): (n,)."""
-        return self.q_net(torch.cat((self.inputs(s), a), dim=-1)).squeeze(-1)
+        return self.q_net(torch.cat((s, a), dim=-1)).squeeze(-1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -309,7 +299,7 @@ class Learner:
         L_C, Q = self.critic_loss(s, a, *rest)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
-        u, u_demo = net.u(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
+        u, u_demo = net.mu_net(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
         a_own, a_hat = torch.tanh(u), torch.tanh(u_demo)
         L_O = loss_O(net.Q(s, a_own))
         with torch.no_grad():
@@ -317,7 +307,7 @@ class Learner:
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
         if f.keep_clone and B_d:
-            a_clone = torch.tanh(self.clone_net(net.inputs(s)))
+            a_clone = torch.tanh(self.clone_net(s))
             L_BC = L_BC + loss_BC(a_clone, a_own, torch.ones_like(Q))
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
@@ -332,13 +322,8 @@ class Learner:
         )]  # fmt: skip
 
     def clone(self, B_o, B_d):
-        """Before the first step: normalisation by B_d; clone_iters updates of the actor, M = 1, then of the critic."""
+        """Before the first step: clone_iters updates of the actor on B_d, M = 1, then of the critic on B_o."""
         f, net = self.flags, self.net
-        if f.normalize_obs:
-            s = B_d.rows[:, : OBS_DIM[f.task]]
-            for x in (net, self.target):
-                x.s_mean.copy_(s.mean(0))
-                x.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
         for _ in trange(f.clone_iters, desc="actor cloning", disable=f.quiet or None):
             s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a_demo, net.pi(s_demo), torch.ones_like(a_demo[:, 0]))

@@ -424,18 +424,6 @@ def test_critic_layernorm_sits_after_each_hidden_linear_layer_of_the_critic_only
         assert [type(layer).__name__ for layer in net.mu_net] == 2 * ["Linear", "ReLU"] + ["Linear"]
 
 
-def test_normalize_obs_is_by_mean_and_deviation_of_the_demonstrated_states_or_a_fifth():
-    B_d, s = ddpg.ReplayBuffer(22, 50, "none"), states(50) * np.logspace(-2, 1, 22).astype(np.float32) + 3
-    for x in s:
-        B_d.store(x, np.zeros(4), 0.0, x, 0.9)
-    learner = ddpg.Learner(resolve(hidden_sizes=(8,), normalize_obs=True))
-    learner.clone(None, B_d)
-    for net in (learner.net, learner.target):
-        seen, std = net.inputs(torch.from_numpy(s)), torch.from_numpy(s).std(0)
-        torch.testing.assert_close(seen.mean(0), torch.zeros(22), rtol=0, atol=1e-4)
-        torch.testing.assert_close(seen.std(0), std / std.clamp(min=0.2), rtol=1e-3, atol=1e-4)
-
-
 # ---- defaults --------------------------------------------------------------------------------------------------------
 
 DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 5; 5 T, 2 T and T are ours
@@ -447,7 +435,7 @@ DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 
 }  # fmt: skip
 AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1,
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
-                    clone_iters=0, keep_clone=False, normalize_obs=False, hindsight=0, critic_layernorm=False,
+                    clone_iters=0, keep_clone=False, hindsight=0, critic_layernorm=False,
                     updates_per_step=1)  # fmt: skip
 
 
