@@ -38,16 +38,12 @@ class Task:
     cube: str  # "" (none), "obstacle" (P2P-O) or "object" (P&P)
     sector_start: float  # demonstration start angle, in units of 2*pi/K from the sector's number k
     test_theta: float  # start angle of the test study
-    return_min: float  # no return is smaller: see TASKS
-    return_max: float  # largest possible return: R_1, on P&P R_1 + R_3
 
 
-# return_min: -R_2 for a collision, and P2P's worst 400 steps of distance (under 1.75 m) and effort (under 0.7), -3.7.
-# On the longer tasks it bounds the discounted return: at gamma = 0.99, -R_2 and 100 such steps, -2.5.
 TASKS = {
-    "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4, -4.0, 10.0),
-    "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2, -4.0, 10.0),
-    "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2, -4.0, 12.0),
+    "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4),
+    "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2),
+    "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2),
 }
 
 # The observation, Eq. 2: (name, width, how it changes when the world is rotated about the base axis).

@@ -45,7 +45,7 @@ class Flags(logx.RunFlags):
     demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 2)
-    epochs: int | None = flag(None, "N_ep; 50", low=1)
+    epochs: int = flag(50, "N_ep", low=1)
     steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1, high=10_000_000)
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
@@ -67,10 +67,8 @@ class Flags(logx.RunFlags):
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 4000", low=0)
-    after_kl: str | None = flag(None, "what goes on past target_kl; robust: critic", ("none", "critic", "all"))
     normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d")
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; pnp only")
-    clip_value: bool | None = flag(None, "clip V to the range of possible returns")
 
 
 TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
@@ -78,12 +76,12 @@ TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
     "p2po": dict(num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
-PAPER = dict(epochs=50, symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, pi_lr=3e-4, log_std=-0.5,
-             mask="reward", demos_in_B_o=True, demo_noise=0.0, clone_iters=0, after_kl="none", normalize_obs=False,
-             grasp_input=False, clip_value=False)  # fmt: skip
-ROBUST = dict(epochs=50, symmetry="mirror", gains="fast", train_iters=80, demo_batch_size=256, pi_lr=3e-6,
-              log_std=-2.0, mask="none", demos_in_B_o=False, demo_noise=0.2, clone_iters=4000, after_kl="critic",
-              normalize_obs=True, grasp_input=True, clip_value=True)  # fmt: skip
+PAPER = dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, pi_lr=3e-4, log_std=-0.5,
+             mask="reward", demos_in_B_o=True, demo_noise=0.0, clone_iters=0, normalize_obs=False,
+             grasp_input=False)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", train_iters=80, demo_batch_size=256, pi_lr=3e-6, log_std=-2.0,
+              mask="none", demos_in_B_o=False, demo_noise=0.2, clone_iters=4000, normalize_obs=True,
+              grasp_input=True)  # fmt: skip
 
 
 def recipe_defaults(task, recipe, num_demos=None):
@@ -254,7 +252,6 @@ class Learner:
         self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.log_std, f.grasp_input).to(f.device)
         self.omega, self.nu = [*self.net.mu_net.parameters(), self.net.log_std], list(self.net.v_net.parameters())
         self.optimizer = self.adam(f.pi_lr, f.vf_lr)
-        self.return_range = TASKS[f.task].return_min, TASKS[f.task].return_max
 
     def adam(self, pi_lr, vf_lr):
         return torch.optim.Adam([dict(params=self.omega, lr=pi_lr), dict(params=self.nu, lr=vf_lr)], fused=True)
@@ -265,11 +262,6 @@ class Learner:
         s = gas.seen(s, self.flags.symmetry)
         mu = self.net.mu(torch.from_numpy(s).to(self.flags.device))
         return mu.cpu().numpy(), self.net.log_std.exp().cpu().numpy()
-
-    def clipped_V(self, s):
-        """V_nu(s), with clip_value within possible returns."""
-        V = self.net.V(s)
-        return V.clamp(*self.return_range) if self.flags.clip_value else V
 
     def demo_batch(self, B_d, R_demo):
         """A batch of B_d: s (n, obs_dim), a (n, 4), r and reward-to-go (n,)."""
@@ -310,44 +302,40 @@ class Learner:
         with torch.no_grad():
             mu_old, sigma_old = net.mu(s), net.log_std.exp()
             log_prob_old = net.pi(mu_old).log_prob(a)
-            V = self.clipped_V(s)
-            last_V = torch.where(end > 0, (1 - zeta) * self.clipped_V(s2), 0.0)  # a timeout is no true end
+            V = net.V(s)
+            last_V = torch.where(end > 0, (1 - zeta) * net.V(s2), 0.0)  # a timeout is no true end
         R = discounted_sum(r, end, last_V, f.gamma).to(f.device)
         A = advantages(r, end, V, last_V, f.gamma, f.lam).to(f.device)
 
-        measured, within_kl = [], True
+        measured = []
         for _ in range(f.train_iters):
             i = torch.randint(len(s), (min(f.batch_size, len(s)),)).to(f.device)
             mu, own_i = net.mu(s[i]), own[i] > 0
             with torch.no_grad():
                 D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), net.pi(mu))[own_i].mean()  # NaN without own ones
             if f.target_kl <= D_KL:
-                within_kl = False
-            if not within_kl and f.after_kl == "none":
                 break
             V_s = net.V(s[i])
             L_C = loss_C(V_s, R[i])
             ratio = (net.pi(mu).log_prob(a[i]) - log_prob_old[i]).exp()
-            L_O = loss_O(ratio, A[i], f.clip_ratio)
-            L_A = L_O if within_kl else None
+            L_A = L_O = loss_O(ratio, A[i], f.clip_ratio)
             L_BC = M = bc_relative_error = mean_action_demo = L_C.new_full((), math.nan)
             if B_d.filled:
                 s_demo, a_demo, r_demo, R_demo_i = self.demo_batch(B_d, R_demo)
                 a_hat = net.mu(s_demo)
                 with torch.no_grad():
                     threshold = {"reward": r_demo, "return": R_demo_i, "none": torch.inf}[f.mask]
-                    M = mask(self.clipped_V(s_demo), threshold)
+                    M = mask(net.V(s_demo), threshold)
                 L_BC = loss_BC(a_demo, a_hat, M)
-                if within_kl or f.after_kl == "all":
-                    L_A = loss_A(L_O if within_kl else 0.0, L_BC, f.lambda_bc)
+                L_A = loss_A(L_O, L_BC, f.lambda_bc)
                 mean_action_demo = a_hat.abs().mean()
                 bc_relative_error = ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum()
 
             self.optimizer.zero_grad()
-            (L_C if L_A is None else L_C + L_A).backward()  # L_C moves the critic, L_A the actor
+            (L_C + L_A).backward()  # L_C moves the critic, L_A the actor
             self.optimizer.step()
             measured.append([x.detach() for x in (
-                L_O, L_BC, L_C, L_O.new_full((), math.nan) if L_A is None else L_A, M.mean(), V_s.mean(), V_s.max(),
+                L_O, L_BC, L_C, L_A, M.mean(), V_s.mean(), V_s.max(),
                 mu[own_i].abs().mean(), mean_action_demo, bc_relative_error, D_KL, net.log_std.exp().mean(),
             )])  # fmt: skip
         if not measured:

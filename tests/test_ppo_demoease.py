@@ -132,11 +132,10 @@ class Paper:
     """An epoch of Alg. 2 with Eq. 6, 7 and 9 in plain autograd, torch.distributions and two torch.optim.Adam. Shares
     nothing with the source but the weights it starts from.
 
-    compare: what Eq. 9 compares V(s) with ("reward", "return"; "none": M = 1). go_on: what does beyond the KL limit
-    ("none", "critic", "all": cloning too). clip: the range of values."""
+    compare: what Eq. 9 compares V(s) with ("reward", "return"; "none": M = 1)."""
 
-    def __init__(self, learner, compare="reward", go_on="none", clip=None):
-        self.f, self.compare, self.go_on, self.clip = learner.flags, compare, go_on, clip
+    def __init__(self, learner, compare="reward"):
+        self.f, self.compare = learner.flags, compare
         self.mean, self.std = learner.net.s_mean.clone(), learner.net.s_std.clone()
 
         def copy_of(source):
@@ -163,13 +162,12 @@ class Paper:
     def pi(self, s):
         return Normal(self.mu(self.inputs(s)), torch.exp(self.log_std))
 
-    def V(self, s, clip=True):
-        V = self.v(self.inputs(s))[:, 0]
-        return torch.clip(V, *self.clip) if clip and self.clip else V
+    def V(self, s):
+        return self.v(self.inputs(s))[:, 0]
 
     def epoch(self, found, demos, batches, demo_batches):
         """found, demos: the trajectories of B_o and of B_d (or None). batches, demo_batches: rows of them, for each
-        update. Returns (the mean of each figure, updates, updates with L_O)."""
+        update. Returns (the mean of each figure, updates)."""
         f, s, a, own = self.f, flat(found, "s"), flat(found, "a"), flat(found, "own")
         with torch.no_grad():
             old, R, A = self.pi(s), [], []
@@ -181,45 +179,40 @@ class Paper:
         R, A = torch.tensor(R), torch.tensor((np.array(A) - np.mean(A)) / np.std(A), dtype=torch.float32)
         if demos:
             s_d, a_d, r_d, R_d = *(flat(demos, name) for name in ("s", "a", "r")), rewards_to_go(demos, f.gamma)
-        learn_O, updates, with_L_O, figures = True, 0, 0, {}
+        updates, figures = 0, {}
         for k in range(f.train_iters):
             i = batches[k]
             now, of_agent = self.pi(s[i]), own[i] == 1
             D_KL = kl_divergence(Normal(old.mean[i], old.stddev[i]), now).sum(1)[of_agent].mean()
-            learn_O = learn_O and not f.target_kl <= D_KL.item()
-            if not learn_O and self.go_on == "none":
+            if f.target_kl <= D_KL.item():
                 break
             ratio = torch.exp(now.log_prob(a[i]).sum(1) - log_prob_old[i])
             clipped = torch.clip(ratio, 1 - f.clip_ratio, 1 + f.clip_ratio)
             L_O = -torch.sum(torch.minimum(ratio * A[i], clipped * A[i])) / len(i)
-            V = self.V(s[i], clip=False)
+            V = self.V(s[i])
             L_C = torch.sum((R[i] - V) ** 2) / len(i)
             figure = {"L_O": L_O, "L_C": L_C, "V_mean": V.mean(), "V_max": V.max(), "KL": D_KL,
                       "mean_action_own": now.mean[of_agent].abs().mean()}  # fmt: skip
-            L_A = L_O if learn_O else None
+            L_A = L_O
             if demos:
                 j = demo_batches[k]
                 a_hat = self.pi(s_d[j]).mean
                 threshold = {"reward": r_d[j], "return": R_d[j], "none": torch.full((len(j),), math.inf)}[self.compare]
                 M = self.V(s_d[j]) < threshold
                 L_BC = torch.sum((a_d[j][M] - a_hat[M]) ** 2) / (4 * len(j))
-                if learn_O or self.go_on == "all":
-                    L_A = f.lambda_bc * L_BC + (L_O if learn_O else 0)
+                L_A = f.lambda_bc * L_BC + L_O
                 figure |= {"L_BC": L_BC, "mask_fraction": M.float().mean(), "mean_action_demo": a_hat.abs().mean()}
                 figure["bc_relative_error"] = torch.mean((a_hat - a_d[j]) ** 2) / torch.mean(a_d[j] ** 2)
-            figure |= {} if L_A is None else {"L_A": L_A}
+            figure["L_A"] = L_A
             for adam, L, parameters in ((self.adam_pi, L_A, self.omega), (self.adam_v, L_C, self.nu)):
-                gradients = [None] * len(parameters)
-                if L is not None:
-                    gradients = torch.autograd.grad(L, parameters, allow_unused=True)
-                for p, g in zip(parameters, gradients, strict=True):
+                for p, g in zip(parameters, torch.autograd.grad(L, parameters, allow_unused=True), strict=True):
                     p.grad = g
                 adam.step()
             figure["sigma"] = torch.exp(self.log_std).mean()
             for name, value in figure.items():
                 figures.setdefault(name, []).append(value.item())
-            updates, with_L_O = updates + 1, with_L_O + learn_O
-        return {name: np.mean(values) for name, values in figures.items()}, updates, with_L_O
+            updates += 1
+        return {name: np.mean(values) for name, values in figures.items()}, updates
 
 
 @pytest.fixture
@@ -235,24 +228,19 @@ SETTINGS = dict(hidden_sizes=(24, 40, 16), gamma=0.9, lam=0.8, clip_ratio=0.1, l
                 train_iters=6, batch_size=40, demo_batch_size=30, log_std=-0.7, symmetry="none")  # fmt: skip
 
 
-@pytest.mark.parametrize("task, compare, go_on, clip, target_kl, with_demos", [
-    ("p2p", "reward", "none", None, NEVER, True), ("p2p", "reward", "none", None, 0.025, False),
-    ("p2p", "return", "all", None, 0.025, True), ("p2p", "none", "critic", (-4, 10), 0.025, True),
-    ("pnp", "none", "critic", (-4, 12), NEVER, True),
-], ids=["as published", "no demonstrations, a KL limit", "rewards-to-go, cloning goes on", "the critic alone goes on",
-        "the cube's input"])  # fmt: skip
-def test_an_epoch_is_that_of_a_plain_reimplementation_of_the_paper(
-    task, compare, go_on, clip, target_kl, with_demos, draws
-):
+@pytest.mark.parametrize("task, compare, target_kl, with_demos", [
+    ("p2p", "reward", NEVER, True), ("p2p", "reward", 0.025, False), ("p2p", "return", 0.025, True),
+    ("pnp", "none", NEVER, True),
+], ids=["as published", "no demonstrations, a KL limit", "rewards-to-go, a KL limit", "the cube's input"])  # fmt: skip
+def test_an_epoch_is_that_of_a_plain_reimplementation_of_the_paper(task, compare, target_kl, with_demos, draws):
     torch.manual_seed(1)
     obs_dim = {"p2p": 22, "pnp": 25}[task]
-    learner = ppo.Learner(resolve(task=task, mask=compare, after_kl=go_on, clip_value=bool(clip), target_kl=target_kl,
-                                  grasp_input=task == "pnp", **SETTINGS))  # fmt: skip
+    learner = ppo.Learner(resolve(task=task, mask=compare, target_kl=target_kl, grasp_input=task == "pnp", **SETTINGS))
     with torch.no_grad():
-        learner.net.v_net[-1].weight.mul_(60)  # values on both sides of the rewards, and beyond the clip
+        learner.net.v_net[-1].weight.mul_(60)  # values on both sides of the rewards
         learner.net.s_mean.uniform_(-0.3, 0.3)
         learner.net.s_std.uniform_(0.6, 1.5)
-    paper = Paper(learner, compare, go_on, clip)
+    paper = Paper(learner, compare)
     found = [*trajectories(["true", "timeout"], obs_dim, 3, own=0), *trajectories(ENDS, obs_dim, 4)]
     demos = trajectories(["true", "true", "timeout", "true", "timeout", "true"], obs_dim, 7, own=0)
     for x in found + demos if task == "pnp" else ():  # in half of the states the cube is grasped
@@ -265,9 +253,8 @@ def test_an_epoch_is_that_of_a_plain_reimplementation_of_the_paper(
         measured = learner.updates(B_o, B_d, rewards_to_go(demos))
         batches, demo_batches = ([i for high, i in draws if high == B.filled] for B in (B_o, B_d))
         assert {len(i) for i in batches} == {40} and {len(i) for i in demo_batches} == ({30} if with_demos else set())
-        expected, updates, with_L_O = paper.epoch(found, demos if with_demos else None, batches, demo_batches)
-        assert updates == (with_L_O if go_on == "none" else 6)
-        counts.append(with_L_O)
+        expected, updates = paper.epoch(found, demos if with_demos else None, batches, demo_batches)
+        counts.append(updates)
         for name, value in expected.items():
             assert measured.pop(name) == pytest.approx(value, rel=1e-4, abs=1e-5), name
         assert all(math.isnan(value) for value in measured.values())  # what needs B_d, without it
@@ -315,23 +302,19 @@ def moved(learner, before):
 
 
 @pytest.mark.parametrize("with_demos", [True, False])
-@pytest.mark.parametrize("after_kl", ["none", "critic", "all"])
-def test_past_the_kl_limit_goes_on_what_the_flag_says(after_kl, with_demos):
+def test_past_the_kl_limit_everything_rests(with_demos):
     demos = trajectories(ENDS, seed=8, own=0)
     B_d, R = (buffer_of(demos), rewards_to_go(demos)) if with_demos else (empty_buffer(), torch.zeros(0))
-    learner, B_o = a_learner(after_kl=after_kl, mask="none", target_kl=0.0, train_iters=5)  # met before the first
+    learner, B_o = a_learner(mask="none", target_kl=0.0, train_iters=5)  # met before the first
     before = weights_of(learner)
-    measured = learner.updates(B_o, B_d, R)
-    goes_on = {"none": set(), "critic": {"v_net"}, "all": {"v_net", "mu_net"} if with_demos else {"v_net"}}
-    assert moved(learner, before) == goes_on[after_kl]  # sigma is L_O's alone
-    assert (measured is None) == (after_kl == "none")
-    learner, B_o = a_learner(after_kl=after_kl, target_kl=NEVER, train_iters=5)
+    assert learner.updates(B_o, B_d, R) is None and not moved(learner, before)
+    learner, B_o = a_learner(target_kl=NEVER, train_iters=5)
     learner.updates(B_o, B_d, R)
     assert moved(learner, before) == {"mu_net", "log_std", "v_net"}
 
 
 def test_the_demonstrators_samples_alone_never_stop_an_epoch(draws):
-    learner, B_o = a_learner(trajectories(ENDS, own=0), target_kl=1e-9, after_kl="none", train_iters=5)
+    learner, B_o = a_learner(trajectories(ENDS, own=0), target_kl=1e-9, train_iters=5)
     draws.clear()
     measured = learner.updates(B_o, empty_buffer(), torch.zeros(0))
     assert len(draws) == 5 and math.isnan(measured["KL"])
@@ -351,16 +334,6 @@ def test_the_policy_loss_clips_only_what_would_move_the_ratio_further():
 def test_the_mask_picks_the_rows_whose_state_is_worth_less_than_the_threshold():
     V, threshold = torch.tensor([0.5, 2.0, -2.0, -2.0, 1e-6]), torch.tensor([1.0, 2.0, -1.0, -3.0, 0.0])
     assert ppo.mask(V, threshold).tolist() == [1, 0, 1, 0, 0]  # Eq. 9: <, so not where they are equal
-
-
-def test_clip_value_holds_values_within_the_possible_returns():
-    for task, highest in (("p2p", 10.0), ("pnp", 12.0)):
-        learner = ppo.Learner(resolve(task=task, hidden_sizes=(8,), clip_value=True))
-        for value, clipped in ((100.0, highest), (-100.0, -4.0), (9.0, 9.0)):
-            with torch.no_grad():
-                learner.net.v_net[-1].weight.zero_()
-                learner.net.v_net[-1].bias.fill_(value)
-                assert learner.clipped_V(torch.zeros(1, ppo.OBS_DIM[task])).item() == clipped
 
 
 # ---- before the first step -------------------------------------------------------------------------------------------
@@ -567,7 +540,7 @@ DEFAULTS = {  # Table 2 (pnp), Table 1 (the others), Sec. 4.2; N and lambda are 
 }
 AS_PUBLISHED = dict(recipe="paper", epochs=50, steps_per_epoch=4000, train_iters=20, batch_size=800, gamma=0.99,
                     demo_batch_size=100, lam=0.97, clip_ratio=0.2, target_kl=0.02, symmetry="gas", partitions=4,
-                    mask="reward", demos_in_B_o=True, after_kl="none", clone_iters=0,
+                    mask="reward", demos_in_B_o=True, clone_iters=0,
                     pi_lr=3e-4, vf_lr=1e-3, log_std=-0.5)  # fmt: skip - the last three: spinningup
 
 
