@@ -39,7 +39,7 @@ from tqdm import tqdm
 import gas
 import logx
 import pid_demo
-from kinova_env import OBS_DIM, TASKS, grasped, start_posture
+from kinova_env import OBS_DIM, TASKS, grasped, has_display, start_posture
 from logx import flag
 
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
@@ -348,10 +348,7 @@ def show(agents, numbers, path=None, **settings):
     """Trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
     where it is None. settings: start, horizon."""
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
-    try:
-        made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
-    except ValueError as error:  # no display
-        raise logx.BadInput(f"--watch: {logx.one_line(error)}") from None
+    made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
         pid_demo.film(made, path, [FIRST_SEED + i for i in numbers])
         print(f"wrote {path}")
@@ -404,6 +401,7 @@ def check(flags):
         (gif and (gif.is_dir() or not gif.absolute().parent.is_dir()), f"--gif {gif}: must be a file in a folder"),
         (gif and gif.suffix == ".mp4" and no_video, f"--gif {gif}: needs pip install imageio imageio-ffmpeg"),
         (gif and flags.watch, "--gif, --watch: one of them at a time"),
+        (flags.watch and not has_display(), "--watch: needs a display, and DISPLAY is not set; --gif FILE needs none"),
         (flags.show and not (gif or flags.watch), "--show: goes with --gif or --watch; --first_trial else"),
         (flags.watch and len(flags.runs) + flags.pid + bool(flags.versus) > 1, "--watch: one agent at a time"),
     ):

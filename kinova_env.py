@@ -8,6 +8,7 @@
 The class docstring of `KinovaEnv` says what goes in and what comes out. Importing this file starts no simulator.
 """
 
+import contextlib
 import math
 import os
 import sys
@@ -92,6 +93,11 @@ SIDE = 0.006375 + 2 * 0.00017505 - 0.005375  # the TCP lies this far to the left
 TIME_STEP = 0.02  # s: 50 Hz, one physics step per action
 CUBE_SIZE = 0.04  # m
 STAGES = ("train", "demo", "test")
+
+
+def has_display():
+    """Whether PyBullet can open its window."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
 def tcp(q):
@@ -266,7 +272,8 @@ class KinovaEnv(gymnasium.Env):
     `info` holds `is_success`, `collision`, `grasped`, `distance` (m), `effort` (norm of tau_hat) and `reward_terms`.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
+    # "human" where there is a screen
+    metadata = {"render_modes": ["human"] * has_display() + ["rgb_array"], "render_fps": 50}
 
     def __init__(self, task="p2p", stage="train", partitions=4, render_mode=None, width=640, height=480):
         if task not in TASKS:
@@ -275,9 +282,9 @@ class KinovaEnv(gymnasium.Env):
             raise ValueError(f"stage {stage!r}: must be one of {', '.join(STAGES)}")
         if not isinstance(partitions, int) or partitions < 1:
             raise ValueError(f"partitions {partitions!r}: must be a whole number of at least 1")
-        if render_mode not in (None, *self.metadata["render_modes"]):
+        if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode {render_mode!r}: must be None, 'human' or 'rgb_array'")
-        if render_mode == "human" and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        if render_mode == "human" and not has_display():
             raise ValueError("render_mode 'human': needs a display, and DISPLAY is not set; use 'rgb_array'")
         self.task, self.stage, self.partitions = task, stage, partitions
         self.row = TASKS[task]
@@ -287,6 +294,7 @@ class KinovaEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-bound, bound)
         self._velocity_scale = [v * self.row.speed for v in VELOCITY_MAX]
         self.episode = 0  # counts resets, so that a controller sees a new episode
+        self.goal = self._began = None
         self._client = pybullet.connect(pybullet.GUI if render_mode == "human" else pybullet.DIRECT)
         self._build_world()
 
@@ -401,9 +409,12 @@ class KinovaEnv(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         """(observation, info); options as in the class's docstring. Raises ValueError that names an unreachable one."""
+        if self._client is None:
+            raise RuntimeError("reset() after close()")
         super().reset(seed=seed)
         options = options or {}
         self._check_options(options)
+        self._began, self._actions = (self.np_random.bit_generator.state, options), []
         self.episode += 1
         if self._touched:
             self._build_world()  # contacts leave caches behind: an episode must not depend on the one before it
@@ -447,10 +458,13 @@ class KinovaEnv(gymnasium.Env):
 
     def step(self, action):
         """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it has a NaN."""
+        if self.goal is None:
+            raise RuntimeError(f"step() {'after close()' if self._client is None else 'before reset()'}")
         action = action.tolist() if isinstance(action, np.ndarray) else action
         if any(a != a for a in action):
             raise ValueError(f"action {action!r}: has a NaN")
         velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
+        self._actions.append(action)
         client = self._client
         pybullet.setJointMotorControlArray(self._robot, ACTIVE_JOINTS, pybullet.VELOCITY_CONTROL, forces=TAU_MAX,
                                            targetVelocities=velocities, physicsClientId=client)  # fmt: skip
@@ -536,6 +550,8 @@ class KinovaEnv(gymnasium.Env):
         """"rgb_array": (height, width, 3) uint8, drawn without a display. "human": None, the window draws itself."""
         if self.render_mode != "rgb_array":
             return None
+        if self._client is None:
+            raise RuntimeError("render() after close()")
         id_ = {"physicsClientId": self._client}
         view = pybullet.computeViewMatrixFromYawPitchRoll([0, 0, 0.36], 1.75, 38, -22, 0, 2)
         lens = pybullet.computeProjectionMatrixFOV(42, self.width / self.height, 0.1, 5)
@@ -544,9 +560,35 @@ class KinovaEnv(gymnasium.Env):
         return np.asarray(rgba, dtype=np.uint8).reshape(self.height, self.width, 4)[..., :3]
 
     def close(self):
-        if self._client is not None:
+        if getattr(self, "_client", None) is not None:
             pybullet.disconnect(physicsClientId=self._client)
-            self._client = None
+            self._client = self.goal = None
+
+    def __del__(self):
+        with contextlib.suppress(Exception):  # at the interpreter's end PyBullet may be gone
+            self.close()
+
+    # ---- copies ---------------------------------------------------------------------------------------------------
+    # A simulator does not copy: copy.deepcopy and pickle make a new one and play the episode again, action by action.
+
+    def __getstate__(self):
+        if self._client is None:
+            raise RuntimeError("a copy after close()")
+        made_with = self.task, self.stage, self.partitions, self.render_mode, self.width, self.height
+        state = {"made_with": made_with, "episode": self.episode, "spec": self.spec}
+        if self._began:
+            state |= {"began": self._began, "actions": self._actions}
+        return state | {"random": (self._np_random, self._np_random_seed)}
+
+    def __setstate__(self, state):
+        self.__init__(*state["made_with"])
+        if "began" in state:
+            self.np_random.bit_generator.state, options = state["began"]
+            self.reset(options=options)
+            for action in state["actions"]:
+                self.step(action)
+        self._np_random, self._np_random_seed = state["random"]
+        self.episode, self.spec = state["episode"], state["spec"]
 
 
 for _task, _row in TASKS.items():

@@ -325,6 +325,8 @@ def check(flags):
     jobs = [name for name in ("record", "trials", "watch", "gif") if getattr(flags, name)]
     if len(jobs) != 1:
         raise logx.BadInput(f"{' '.join(f'--{job}' for job in jobs)}: give one of --record --trials --watch --gif")
+    if flags.watch and not kinova_env.has_display():
+        raise logx.BadInput("--watch: needs a display, and DISPLAY is not set; --gif FILE needs none")
     if bool(flags.record) != bool(flags.out):
         raise logx.BadInput("--record and --out: give both or neither")
     if flags.symmetry == "gas" and flags.stage != "demo":

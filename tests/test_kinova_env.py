@@ -1,7 +1,11 @@
 """kinova_env.py: the class docstring against the code, the start of an episode, reward and end, one process."""
 
+import copy
 import functools
+import gc
 import math
+import pickle
+import re
 import subprocess
 import sys
 import warnings
@@ -278,12 +282,67 @@ def test_pick_and_place_cubes_can_be_grasped_and_goals_are_uniform_however_few_c
         assert len(postures(cube, np.linspace(-0.3, 0.3, 61)))
 
 
+# ---- copies and misuse -----------------------------------------------------------------------------------------------
+
+
+COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_copy_goes_on_as_the_original_would_and_leaves_it_alone(task, how):
+    env, rng = gymnasium.make(TASKS[task].env_id, stage="demo", partitions=3), np.random.default_rng(0)
+    env.reset(seed=3)
+    env.reset(options={"partition": 1})
+    for _ in range(5):
+        env.step(0.3 * rng.uniform(-1, 1, 4))
+    other = COPIES[how](env)
+    actions = 0.3 * rng.uniform(-1, 1, (8, 4))
+    there = [other.step(a)[:4] for a in actions]  # first: the original must not have moved with it
+    here = [env.step(a)[:4] for a in actions]
+    for one, same in zip(here, there, strict=True):
+        assert np.array_equal(one[0], same[0]) and one[1:] == same[1:]
+    other.close()
+    env.step(actions[0])  # closing the copy closed nothing else
+    env.close()
+
+
+def test_a_copy_draws_the_episodes_that_the_original_would_draw(make):
+    env = make("pnp")
+    env.reset(seed=5)
+    other = copy.deepcopy(env)
+    assert other.unwrapped.episode == env.unwrapped.episode
+    for _ in range(3):
+        assert np.array_equal(env.reset()[0], other.reset()[0])
+    other.close()
+    assert np.array_equal(copy.deepcopy(make("p2p")).reset(seed=1)[0], make("p2p").reset(seed=1)[0])  # before any reset
+
+
+def test_an_environment_that_is_dropped_takes_its_simulator_along():
+    client = KinovaEnv()._client
+    gc.collect()
+    assert not kinova_env.pybullet.isConnected(client)
+
+
+def test_misuse_is_one_clear_line():
+    env = KinovaEnv(render_mode="rgb_array", width=32, height=24)
+    with pytest.raises(RuntimeError, match=r"step\(\) before reset\(\)"):
+        env.step(np.zeros(4))
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    uses = {"reset()": env.reset, "step()": lambda: env.step(np.zeros(4)), "render()": env.render,
+            "a copy": lambda: copy.deepcopy(env)}  # fmt: skip
+    for name, use in uses.items():
+        with pytest.raises(RuntimeError, match=re.escape(f"{name} after close()")):
+            use()
+
+
 # ---- observation, reward, end ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_gymnasiums_checker_finds_nothing_to_warn_of(monkeypatch, task):
-    monkeypatch.setitem(KinovaEnv.metadata, "render_modes", ["rgb_array"])  # "human" needs a display
+def test_gymnasiums_checker_finds_nothing_to_warn_of(task):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for settings in ({}, {"render_mode": "rgb_array", "width": 32, "height": 24}, {"stage": "demo"}):

@@ -443,7 +443,7 @@ BAD = [  # arguments ({} is an empty folder), what the line names
     ("--trials 1 --K_D nan", "--K_D nan"),
     ("--trials 1 --symmetry gas --stage test", "--stage"),
     ("--trials 1 --partitions 40 --task pnp", "--partitions 40"),
-    ("--watch", "--watch: render_mode 'human': needs a display"),
+    ("--watch", "--watch: needs a display"),
 ]
 
 
