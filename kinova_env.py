@@ -412,7 +412,7 @@ class KinovaEnv(gymnasium.Env):
         if self._client is None:
             raise RuntimeError("reset() after close()")
         super().reset(seed=seed)
-        options = options or {}
+        options = dict(options or {})  # a copy: it is kept
         self._check_options(options)
         self._began, self._actions = (self.np_random.bit_generator.state, options), []
         self.episode += 1
@@ -460,7 +460,7 @@ class KinovaEnv(gymnasium.Env):
         """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it has a NaN."""
         if self.goal is None:
             raise RuntimeError(f"step() {'after close()' if self._client is None else 'before reset()'}")
-        action = action.tolist() if isinstance(action, np.ndarray) else action
+        action = action.tolist() if isinstance(action, np.ndarray) else list(action)  # a copy: it is kept
         if any(a != a for a in action):
             raise ValueError(f"action {action!r}: has a NaN")
         velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
@@ -560,12 +560,12 @@ class KinovaEnv(gymnasium.Env):
         return np.asarray(rgba, dtype=np.uint8).reshape(self.height, self.width, 4)[..., :3]
 
     def close(self):
-        if getattr(self, "_client", None) is not None:
+        if self._client is not None:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = self.goal = None
 
     def __del__(self):
-        with contextlib.suppress(Exception):  # at the interpreter's end PyBullet may be gone
+        with contextlib.suppress(Exception):  # nothing was made, or PyBullet is gone at the interpreter's end
             self.close()
 
     # ---- copies ---------------------------------------------------------------------------------------------------

@@ -318,6 +318,16 @@ def test_a_copy_draws_the_episodes_that_the_original_would_draw(make):
     assert np.array_equal(copy.deepcopy(make("p2p")).reset(seed=1)[0], make("p2p").reset(seed=1)[0])  # before any reset
 
 
+def test_a_copy_plays_what_was_asked_for_whatever_became_of_the_lists_since(make):
+    env, action, options = make("p2p").unwrapped, [0.3, 0.2, 0.1, 0.0], {"goal": (1.6, 0.5, 0.4)}
+    env.reset(options=options)
+    env.step(action)
+    action[:], options["goal"] = [1.0] * 4, (-1.6, 0.5, 0.4)
+    other = copy.deepcopy(env)
+    assert other.q == env.q and other.goal == env.goal
+    other.close()
+
+
 def test_an_environment_that_is_dropped_takes_its_simulator_along():
     client = KinovaEnv()._client
     gc.collect()
