@@ -81,8 +81,7 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
 PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=False,
              hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
 ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500, keep_clone=True,
-              hindsight=2, updates_per_step=0.25, critic_layernorm=True,
-              start_steps=0)  # fmt: skip
+              hindsight=2, updates_per_step=0.25, critic_layernorm=True, start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
 
 
@@ -140,8 +139,7 @@ class ReplayBuffer:
             s, s2 = gas.rotate(s, angle), gas.rotate(s2, angle)  # psi is the identity: a stays
         if self.symmetry == "mirror":
             half = slice(None, None, 2)  # rows are drawn at random: this half of them is a random one
-            s2[half], _ = gas.mirror(s2[half], a[half])
-            s[half], a[half] = gas.mirror(s[half], a[half])
+            (s[half], s2[half]), a[half] = gas.mirror(torch.stack((s[half], s2[half])), a[half])
         return [x.to(device) for x in (s, a, r.squeeze(1), s2, discount.squeeze(1))]
 
     def state(self):
@@ -295,8 +293,8 @@ class Learner:
     def update(self, B_o, B_d):
         """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
         f, net = self.flags, self.net
-        s, a, *rest = B_o.sample(f.batch_size, f.device)
-        L_C, Q = self.critic_loss(s, a, *rest)
+        s, a, *_ = batch = B_o.sample(f.batch_size, f.device)
+        L_C, Q = self.critic_loss(*batch)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
         u, u_demo = net.mu_net(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two

@@ -75,17 +75,20 @@ def psi(action, k, K=4):
     return action
 
 
+def _facing_ahead(out, index):
+    """q_1 = 0 in states of the arm's own frame, written into `out`."""
+    for name, value in (("angle", 0.0), ("sine", 0.0), ("cosine", 1.0)):
+        out[..., index[name][0]] = value
+    return out
+
+
 def canonical(obs):
     """The state in the arm's own frame: the world turned so that q_1 = 0 (then nothing about the base angle is left).
 
     obs: (..., 22 or 25). canonical(rotate(obs, angle)) equals canonical(obs) for every angle.
     """
     _, _, index = _library(obs)
-    out = rotate(obs, obs[..., index["angle"][0]])
-    out[..., index["angle"][0]] = 0.0
-    out[..., index["sine"][0]] = 0.0
-    out[..., index["cosine"][0]] = 1.0
-    return out
+    return _facing_ahead(rotate(obs, obs[..., index["angle"][0]]), index)
 
 
 def cylinder(obs):
@@ -97,28 +100,25 @@ def cylinder(obs):
     which has seen a few of these angles can act well at all of them.
     """
     xp, out, index = _library(obs)
-    q1 = index["angle"][0]
     i_g, i_e, *i_o = index["vector"]
     x_e, y_e = obs[..., i_g] - obs[..., i_e], obs[..., i_g + 1] - obs[..., i_e + 1]
     theta_e = xp.arctan2(y_e, x_e)
-    from_plane = wrap(theta_e + obs[..., q1])  # of the TCP: joint 1 points down
+    from_plane = wrap(theta_e + obs[..., index["angle"][0]])  # of the TCP: joint 1 points down
     for i in (i_g, *i_o):
         x, y = obs[..., i], obs[..., i + 1]
-        turn = wrap(xp.arctan2(y, x) - theta_e)
-        out[..., i], out[..., i + 1] = xp.hypot(x, y), from_plane + turn
+        rho, turn = xp.hypot(x, y), wrap(xp.arctan2(y, x) - theta_e)
+        out[..., i], out[..., i + 1] = rho, from_plane + turn
         if i == i_g:
-            out[..., i_e], out[..., i_e + 1] = xp.hypot(x, y) - xp.hypot(x_e, y_e), turn
-    for name, value in (("angle", 0.0), ("sine", 0.0), ("cosine", 1.0)):
-        out[..., index[name][0]] = value
-    return out
+            out[..., i_e], out[..., i_e + 1] = rho - xp.hypot(x_e, y_e), turn
+    return _facing_ahead(out, index)
 
 
 def mirror(obs, action):
     """State and action with left and right exchanged: reflected in the arm's plane, or in the world's x-z plane where
     the state is of the world.
 
-    obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Not
-    exact, but to 1 mm: the TCP lies 1.35 mm beside the arm's plane (kinova_env.SIDE).
+    obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Exact
+    to 1 mm: the TCP lies 1.35 mm beside the arm's plane (kinova_env.SIDE).
     """
     _, out, index = _library(obs)
     first = [index[name][0] for name in ("angle", "sine", "")]  # q_1, sin q_1, dq_1/dt
@@ -131,7 +131,10 @@ def mirror(obs, action):
 
 def seen(obs, symmetry):
     """The state as networks see it under --symmetry: (..., 22 or 25), of `none`, `gas` and `so2` as it is."""
-    return {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}.get(symmetry, lambda s: s)(obs)
+    return _VIEWS[symmetry](obs) if symmetry in _VIEWS else obs
+
+
+_VIEWS = {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}
 
 
 def partition_of(obs, K=4):
