@@ -39,6 +39,7 @@ from tqdm import tqdm
 import gas
 import logx
 import pid_demo
+from film import film
 from kinova_env import OBS_DIM, TASKS, grasped, has_display, start_posture
 from logx import flag
 
@@ -350,7 +351,7 @@ def show(agents, numbers, path=None, **settings):
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
     made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
-        pid_demo.film(made, path, [FIRST_SEED + i for i in numbers])
+        film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers})
         print(f"wrote {path}")
     for i in () if path else numbers:
         row, *_ = trial(*made[next(iter(made))], i)

@@ -18,13 +18,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-_stderr = os.dup(2)
-try:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # PyBullet prints its build time at import
-    import pybullet
-finally:
-    os.dup2(_stderr, 2)
-    os.close(_stderr)
+import film
+from film import pybullet
 
 URDF = Path(__file__).parent / "data" / "robot" / "gen3_2f85.urdf"
 
@@ -295,8 +290,9 @@ class KinovaEnv(gymnasium.Env):
         self._velocity_scale = [v * self.row.speed for v in VELOCITY_MAX]
         self.episode = 0  # counts resets, so that a controller sees a new episode
         self.goal = self._began = None
-        self._client = pybullet.connect(pybullet.GUI if render_mode == "human" else pybullet.DIRECT)
-        self._build_world()
+        with film.silence(*[1, 2] * (render_mode == "human")):
+            self._client = film.open_window() if render_mode == "human" else pybullet.connect(pybullet.DIRECT)
+            self._build_world()
 
     # ---- world ----------------------------------------------------------------------------------------------------
 
@@ -320,20 +316,16 @@ class KinovaEnv(gymnasium.Env):
             pybullet.changeDynamics(self._robot, link, linearDamping=0, angularDamping=0, **id_)
         # Links that Actuators 4 and 6 hold together can never meet: not parent and child, so excluded by hand.
         pybullet.setCollisionFilterPair(self._robot, self._robot, 4, 6, 0, **id_)
-        self._cube = self._goal_marker = None
+        self._cube = None
         if self.row.cube:
             box = dict(shapeType=pybullet.GEOM_BOX, halfExtents=[CUBE_SIZE / 2] * 3)
             shape = pybullet.createCollisionShape(**box, **id_)
-            visual = pybullet.createVisualShape(**box, rgbaColor=[0.84, 0.37, 0.0, 1], **id_)
+            visual = pybullet.createVisualShape(**box, rgbaColor=[*film.ORANGE, 1], **id_)
             self._cube = pybullet.createMultiBody(0, shape, visual, [0, 0, -1], **id_)
             # The cube never pushes: an episode ends on contact (P2P-O), or the cube has no response at all (P&P).
             pybullet.setCollisionFilterGroupMask(self._cube, -1, 0, 0, **id_)
         if self.render_mode:
-            disc = dict(shapeType=pybullet.GEOM_CYLINDER, radius=0.9, length=0.01, rgbaColor=[0.80, 0.82, 0.84, 1])
-            pybullet.createMultiBody(0, -1, pybullet.createVisualShape(**disc, **id_), [0, 0, -0.006], **id_)
-            ball = dict(shapeType=pybullet.GEOM_SPHERE, radius=EPSILON, rgbaColor=[0.0, 0.62, 0.45, 0.6])
-            ball = pybullet.createVisualShape(**ball, **id_)
-            self._goal_marker = pybullet.createMultiBody(0, -1, ball, [0, 0, -1], **id_)
+            self._mark_goal = film.furnish(self._client, self._robot, self.render_mode == "human", EPSILON)
         self._touched = False
 
     # ---- sampling -------------------------------------------------------------------------------------------------
@@ -432,8 +424,8 @@ class KinovaEnv(gymnasium.Env):
             if self.stage == "demo" and set(options) <= {"partition"}:
                 raise ValueError(f"partitions {self.partitions}: too many, no {self.task} demonstration fits a sector")
         self.goal = cartesian(*goal).tolist()
-        if self._goal_marker is not None:
-            pybullet.resetBasePositionAndOrientation(self._goal_marker, self.goal, [0, 0, 0, 1], self._client)
+        if self.render_mode:
+            self._mark_goal(self.goal)
         if self.render_mode == "human":
             self._show()
         e = [g - p for g, p in zip(self.goal, self.tcp, strict=True)]
@@ -547,21 +539,17 @@ class KinovaEnv(gymnasium.Env):
         self._next_frame = time.monotonic() + TIME_STEP
 
     def render(self):
-        """"rgb_array": (height, width, 3) uint8, drawn without a display. "human": None, the window draws itself."""
+        """ "rgb_array": (height, width, 3) uint8, drawn without a display. "human": None, the window draws itself."""
         if self.render_mode != "rgb_array":
             return None
         if self._client is None:
             raise RuntimeError("render() after close()")
-        id_ = {"physicsClientId": self._client}
-        view = pybullet.computeViewMatrixFromYawPitchRoll([0, 0, 0.36], 1.75, 38, -22, 0, 2)
-        lens = pybullet.computeProjectionMatrixFOV(42, self.width / self.height, 0.1, 5)
-        look = dict(lightDirection=[0.6, -0.8, 1.6], shadow=1, renderer=pybullet.ER_TINY_RENDERER)
-        *_, rgba, _, _ = pybullet.getCameraImage(self.width, self.height, view, lens, **look, **id_)
-        return np.asarray(rgba, dtype=np.uint8).reshape(self.height, self.width, 4)[..., :3]
+        return film.picture(self._client, self.width, self.height, self.goal, EPSILON)
 
     def close(self):
         if self._client is not None:
-            pybullet.disconnect(physicsClientId=self._client)
+            with film.silence(*[1, 2] * (self.render_mode == "human")):
+                pybullet.disconnect(physicsClientId=self._client)
             self._client = self.goal = None
 
     def __del__(self):

@@ -477,7 +477,7 @@ class RunFolder:
         self._bar = tqdm(total=self.total_steps, initial=start, unit="step", smoothing=0.02, mininterval=1,
                          disable=quiet or None)  # fmt: skip
         self._shown = ["eval_success", "epoch", "env_steps", "EpRet", "Success", "EpLen"]
-        self._shown += [c for c in self.columns["progress"][len(PROGRESS):-2] if c not in ("L_O", "L_C", "L_A")]
+        self._shown += [c for c in self.columns["progress"][len(PROGRESS) : -2] if c not in ("L_O", "L_C", "L_A")]
         self._say(f"{self.folder}: {self.total_steps:,} steps, {self._log['demo_env_steps']:,} of the demonstrator")
         heads = {"eval_success": "test %", "Success": "train %", "env_steps": "steps"}
         self._say(" ".join(f"{heads.get(c, c):>{max(7, len(c))}}" for c in self._shown))

@@ -25,6 +25,7 @@ from tqdm import tqdm
 import gas
 import kinova_env
 import logx
+from film import film
 from kinova_env import EPSILON, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
@@ -249,54 +250,6 @@ def demonstrations(flags):
     return {name: demos[name][demos["episode"] < flags.num_demos] for name in ROWS if name in demos}, meta["env_steps"]
 
 
-def frames(agents, seeds, every):
-    """The pictures (height, width, 3) uint8 of episodes, one in `every` steps, the agents' side by side.
-
-    agents: {name: (an env with render_mode "rgb_array", act(obs))}; the names are written on where there are several.
-    """
-    from PIL import Image, ImageDraw
-
-    for seed in seeds:
-        obs = {name: env.reset(seed=seed)[0] for name, (env, _) in agents.items()}
-        picture, t = {}, 0
-        while obs:  # those that have ended keep their last picture
-            for name, (env, act) in agents.items():
-                if name in obs and t % every == 0:
-                    picture[name] = env.render()
-                if name in obs:
-                    obs[name], _, terminated, truncated, _ = env.step(act(obs[name]))
-                    if terminated or truncated:
-                        picture[name] = env.render()
-                        del obs[name]
-            if t % every == 0 or not obs:
-                whole = Image.fromarray(np.concatenate([picture[name] for name in agents], axis=1))
-                for n, name in enumerate(agents if len(agents) > 1 else ()):
-                    ImageDraw.Draw(whole).text((n * whole.width // len(agents) + 6, 4), name, fill="black")
-                yield np.asarray(whole)
-            t += 1
-        yield from [np.asarray(whole)] * 9  # a rest at the end
-
-
-def film(agents, path, seeds, every=4):
-    """Writes `frames` to a GIF, or to an MP4 (with imageio's ffmpeg) where `path` says so, in real time."""
-    from PIL import Image
-
-    fps = 1 / (TIME_STEP * every)
-
-    def mp4(file):
-        import imageio
-
-        with imageio.get_writer(file, format="mp4", fps=fps, macro_block_size=None) as video:
-            for picture in frames(agents, seeds, every):
-                video.append_data(picture)
-
-    def gif(file):
-        first, *rest = [Image.fromarray(picture).quantize(64) for picture in frames(agents, seeds, every)]
-        first.save(file, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
-
-    logx.atomic_write(path, mp4 if str(path).endswith(".mp4") else gif)
-
-
 @dataclasses.dataclass
 class Flags:
     task: str = flag("p2p", choices=tuple(TASKS))
@@ -345,7 +298,7 @@ def show(flags, gains):
     env = gymnasium.make(TASKS[flags.task].env_id, render_mode="rgb_array" if flags.gif else "human", **settings)
     pid, seeds = PID(env, gains, flags.clearance), range(flags.seed, flags.seed + 3)
     if flags.gif:
-        film({"PID": (env, lambda s: pid.act())}, flags.gif, seeds)
+        film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
         print(f"wrote {flags.gif}")
     for seed in () if flags.gif else seeds:
         env.reset(seed=seed)

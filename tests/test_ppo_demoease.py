@@ -538,10 +538,26 @@ DEFAULTS = {  # Table 2 (pnp), Table 1 (the others), Sec. 4.2; N and lambda are 
     "p2po": dict(max_ep_len=500, num_demos=250, lambda_bc=2, hidden_sizes=(256, 1024, 256), demos_per_epoch=50),
     "pnp": dict(max_ep_len=800, num_demos=400, lambda_bc=15, hidden_sizes=(512, 512, 256), demos_per_epoch=80),
 }
-AS_PUBLISHED = dict(recipe="paper", epochs=50, steps_per_epoch=4000, train_iters=20, batch_size=800, gamma=0.99,
-                    demo_batch_size=100, lam=0.97, clip_ratio=0.2, target_kl=0.02, symmetry="gas", partitions=4,
-                    mask="reward", demos_in_B_o=True, clone_iters=0,
-                    pi_lr=3e-4, vf_lr=1e-3, log_std=-0.5)  # fmt: skip - the last three: spinningup
+AS_PUBLISHED = dict(
+    recipe="paper",
+    epochs=50,
+    steps_per_epoch=4000,
+    train_iters=20,
+    batch_size=800,
+    gamma=0.99,
+    demo_batch_size=100,
+    lam=0.97,
+    clip_ratio=0.2,
+    target_kl=0.02,
+    symmetry="gas",
+    partitions=4,
+    mask="reward",
+    demos_in_B_o=True,
+    clone_iters=0,
+    pi_lr=3e-4,
+    vf_lr=1e-3,
+    log_std=-0.5,
+)  # fmt: skip - the last three: spinningup
 
 
 @pytest.mark.parametrize("task", DEFAULTS)

@@ -1,0 +1,191 @@
+"""What films show: the scene around the arm, the camera, and GIF or MP4 files. Nothing here changes what is simulated.
+
+`KinovaEnv(render_mode=...)` stands in this scene; `film` is what `--gif` of evaluate.py and pid_demo.py writes.
+"""
+
+import contextlib
+import ctypes
+import math
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import logx
+
+FLOOR = Path(__file__).parent / "data" / "robot" / "floor.png"
+ORANGE, GREEN, RED = (0.84, 0.37, 0.0), (0.0, 0.62, 0.45), (0.80, 0.15, 0.15)
+CAMERA = dict(distance=1.5, yaw=38, pitch=-20)  # degrees, m
+TARGET = (0, 0, 0.4)  # that the camera looks at
+FIELD, NEAR, FAR = 42, 0.1, 5.0  # of view, degrees; clipping planes, m
+LIGHT = np.array([0.3, -0.4, 2.0])  # from where: nearly above, so that a shadow lies under what throws it
+SMOOTH = 2  # each pixel is the mean of so many by so many
+EVERY = 4  # steps a picture
+
+
+@contextlib.contextmanager
+def silence(*streams):
+    """PyBullet's own prints, which come from C, go nowhere."""
+    sys.stdout.flush()
+    kept = [(stream, os.dup(stream)) for stream in streams]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in streams:
+            os.dup2(nowhere, stream)
+        yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # C keeps what it prints, where that is no terminal
+        for stream, copy in kept:
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(nowhere)
+
+
+with silence(2):  # its build time
+    import pybullet
+
+
+def furnish(client, robot, window, radius):
+    """The scene around `robot`: a floor with a grid of 0.1 m; a thin line that stands under the goal and a disc at its
+    foot, so that depth can be read; and in a window the goal, a ball (`picture` draws its own). Returns move(goal)."""
+    id_ = {"physicsClientId": client}
+    corners = [[x, y, 0] for x, y in ((-0.8, -0.8), (0.8, -0.8), (0.8, 0.8), (-0.8, 0.8))]
+    look = dict(normals=[[0, 0, 1]] * 4, uvs=[[0, 0], [1, 0], [1, 1], [0, 1]], specularColor=[0, 0, 0])
+    shape = pybullet.createVisualShape(
+        pybullet.GEOM_MESH, vertices=corners, indices=[0, 1, 2, 0, 2, 3], rgbaColor=[1, 1, 1, 1], **look, **id_
+    )
+    floor = pybullet.createMultiBody(0, -1, shape, [0, 0, 0], **id_)
+    pybullet.changeVisualShape(floor, -1, textureUniqueId=pybullet.loadTexture(str(FLOOR), **id_), **id_)
+
+    marks = []  # (body, its height above the goal's foot as a function of the goal's height)
+    for shape, height in (
+        (
+            dict(shapeType=pybullet.GEOM_CYLINDER, radius=0.002, length=1.0),
+            lambda z: z - 0.5,
+        ),  # the rest is underground
+        (dict(shapeType=pybullet.GEOM_CYLINDER, radius=radius, length=0.002), lambda z: 0.0),
+        (dict(shapeType=pybullet.GEOM_SPHERE, radius=radius), lambda z: z),
+    )[: 3 if window else 2]:
+        colour = [*GREEN, 0.6 if shape["shapeType"] == pybullet.GEOM_SPHERE else 1]
+        visual = pybullet.createVisualShape(**shape, rgbaColor=colour, **id_)
+        marks.append((pybullet.createMultiBody(0, -1, visual, [0, 0, -5], **id_), height))
+
+    if window:  # where a link has one colour: the lightest of its shapes
+        for shape in sorted(pybullet.getVisualShapeData(robot, **id_), key=lambda shape: shape[7]):
+            pybullet.changeVisualShape(robot, shape[1], rgbaColor=shape[7], **id_)
+
+    def move(goal):
+        for body, height in marks:
+            pybullet.resetBasePositionAndOrientation(body, [*goal[:2], height(goal[2])], [0, 0, 0, 1], **id_)
+
+    return move
+
+
+def open_window():
+    """A PyBullet client with a window that shows what `picture` does. Returns its number."""
+    client = pybullet.connect(pybullet.GUI)
+    id_ = {"physicsClientId": client}
+    pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, **id_)
+    pybullet.configureDebugVisualizer(lightPosition=(3 * LIGHT).tolist(), rgbBackground=[1, 1, 1], **id_)
+    camera = {f"camera{name.capitalize()}": value for name, value in CAMERA.items()}
+    camera["cameraDistance"] *= math.tan(math.radians(FIELD / 2)) / math.tan(math.radians(75 / 2))  # its field is wider
+    pybullet.resetDebugVisualizerCamera(**camera, cameraTargetPosition=TARGET, **id_)
+    return client
+
+
+def picture(client, width, height, goal, radius):
+    """(height, width, 3) uint8 of the scene, with the goal (3,) in m as a translucent ball."""
+    w, h = SMOOTH * width, SMOOTH * height
+    view = pybullet.computeViewMatrixFromYawPitchRoll(TARGET, roll=0, upAxisIndex=2, **CAMERA)
+    lens = pybullet.computeProjectionMatrixFOV(FIELD, width / height, NEAR, FAR)
+    look = dict(lightDirection=LIGHT.tolist(), lightDistance=5, lightAmbientCoeff=0.6, lightDiffuseCoeff=0.42,
+                lightSpecularCoeff=0.05, shadow=1, renderer=pybullet.ER_TINY_RENDERER)  # fmt: skip
+    *_, rgba, depth, _ = pybullet.getCameraImage(w, h, view, lens, **look, physicsClientId=client)
+    rgb = np.asarray(rgba, dtype=np.float32).reshape(h, w, 4)[..., :3].copy()
+    if goal is not None:
+        depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.reshape(depth, (h, w)))  # of the buffer, to m
+        _ball(rgb, depth, np.reshape(view, (4, 4)).T, np.reshape(lens, (4, 4)), goal, radius)
+    return rgb.reshape(height, SMOOTH, width, SMOOTH, 3).mean((1, 3)).astype(np.uint8)
+
+
+def _ball(rgb, depth, view, lens, centre, radius, alpha=0.6):
+    """Blends a ball into a picture (h, w, 3) where nothing lies before it; depth: (h, w) in m along the view."""
+    h, w = depth.shape
+    c = view[:3, :3] @ centre + view[:3, 3]  # in the camera's frame, which looks along -z
+    y, x = np.mgrid[:h, :w]
+    ray = np.stack([(2 * x + 1 - w) / (w * lens[0, 0]), (h - 2 * y - 1) / (h * lens[1, 1]), -np.ones((h, w))], axis=-1)
+    square, along = (ray**2).sum(-1), ray @ c
+    root = along**2 - square * (c @ c - radius**2)
+    near = (along - np.sqrt(np.maximum(root, 0))) / square  # where the ray meets the ball, in m along the view
+    seen = (root > 0) & (near < depth)
+    normal = (ray[seen] * near[seen, None] - c) / radius
+    shade = 0.75 + 0.25 * normal @ (view[:3, :3] @ LIGHT / np.linalg.norm(LIGHT))
+    rgb[seen] = (1 - alpha) * rgb[seen] + alpha * 255 * shade[:, None] * np.array(GREEN)
+
+
+# ---- films -----------------------------------------------------------------------------------------------------------
+
+
+def short(names):
+    """The names without folders and without the parts, between dashes, that all of them have."""
+    parts = [Path(name).name.split("-") for name in names]
+    shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set()
+    kept = ["-".join(part for part in name if part not in shared) for name in parts]
+    return kept if all(kept) and len(set(kept)) == len(kept) else ["-".join(name) for name in parts]
+
+
+def frames(agents, episodes, every=EVERY):
+    """The pictures (height, width, 3) uint8 of episodes, one in `every` steps, the agents' side by side, with a clock
+    and, at an agent's end, a green border for success or a red one.
+
+    agents: {name: (an env with render_mode "rgb_array", act(obs))}; episodes: {what is written: seed}.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    font, names = ImageFont.load_default(14), short(agents)
+    dt = 1 / next(iter(agents.values()))[0].metadata["render_fps"]
+    for title, seed in episodes.items():
+        obs = {name: env.reset(seed=seed)[0] for name, (env, _) in agents.items()}
+        shown, t = dict.fromkeys(agents), 0
+        while obs:  # those that have ended keep their last picture
+            for n, (name, (env, act)) in enumerate(agents.items()):
+                border = None
+                if name in obs and t:
+                    obs[name], _, terminated, truncated, info = env.step(act(obs[name]))
+                    if terminated or truncated:
+                        border = GREEN if info["is_success"] else RED
+                if border or (name in obs and t % every == 0):
+                    shown[name] = Image.fromarray(env.render())
+                    draw = ImageDraw.Draw(shown[name])
+                    text = f"{title}   {t * dt:.1f} s" + f"\n{names[n]}" * (len(agents) > 1)
+                    draw.text((10, 8), text, font=font, fill=(40, 40, 40))
+                if border:
+                    colour = tuple(int(255 * c) for c in border)
+                    draw.rectangle([0, 0, shown[name].width - 1, shown[name].height - 1], outline=colour, width=5)
+                    del obs[name]
+            if t % every == 0 or not obs:
+                yield (whole := np.concatenate([np.asarray(shown[name]) for name in agents], axis=1))
+            t += 1
+        yield from [whole] * 9  # a rest at the end
+
+
+def film(agents, path, episodes, every=EVERY):
+    """Writes `frames` to a GIF, or to an MP4 (with imageio's ffmpeg) where `path` says so, in real time."""
+    from PIL import Image
+
+    fps = next(iter(agents.values()))[0].metadata["render_fps"] / every
+
+    def mp4(file):
+        import imageio
+
+        with imageio.get_writer(file, format="mp4", fps=fps, macro_block_size=None) as video:
+            for one in frames(agents, episodes, every):
+                video.append_data(one)
+
+    def gif(file):
+        # method 2, fast octree: the median cut that is Pillow's own choice gives the orange cube a grey
+        first, *rest = [Image.fromarray(one).quantize(64, method=2) for one in frames(agents, episodes, every)]
+        first.save(file, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
+
+    logx.atomic_write(path, mp4 if str(path).endswith(".mp4") else gif)
