@@ -36,12 +36,16 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
+    num_demos: int | None = flag(
+        None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400, with --demos: all of them", low=0
+    )
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
-    demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
+    demos: str | None = flag(
+        None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"
+    )
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 1; 5 T steps an epoch is ours: the paper does not say)
     epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 50", low=1)
@@ -98,6 +102,8 @@ def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
     flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
+    if flags.demos and flags.num_demos is None:
+        flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp, where a grasp has no goal")

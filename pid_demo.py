@@ -14,6 +14,7 @@ import dataclasses
 import json
 import math
 import os
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -36,6 +37,7 @@ BLEND = 0.1  # m, over which one part of the way over P2P-O's cube becomes the n
 PENALTY = 50.0  # rad of way that a metre of missing clearance is worth
 FINGERS, WIDER = 0.016, 0.04  # m: they reach beyond the TCP; the gripper reaches further to either side than the arm
 NOISE_KEPT = 0.9  # of the noise of one step in the next, 20 ms later
+MINARI = "minari:"  # what the name of a Minari dataset begins with
 GAINS = {"authors": (0.4, 0.2, 0.0), "fast": (1.0, 0.2, 0.0)}  # K_P (1/rad), K_D (s/rad), K_I (1/(rad s))
 
 
@@ -197,14 +199,12 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
     return (gas.aggregate(demos, partitions, num_demos) if symmetry == "gas" else demos), steps
 
 
-def load_demos(path, task):
-    """The arrays of a demonstration file and its `meta`. Raises ValueError with what is wrong with the file."""
+def load_demos(path, task=None):
+    """The arrays of a demonstration file, or of a Minari dataset `minari:NAME`, and its `meta`; task: what it must be
+    of. Raises ValueError with what is wrong with it."""
+    kind = "a Minari dataset of our tasks" if str(path).startswith(MINARI) else "a demonstration file of --record"
     try:
-        if os.path.isfile(path) and not zipfile.is_zipfile(path):
-            raise ValueError("it is no .npz, or one cut short")
-        with np.load(path, allow_pickle=False) as file:
-            demos = {name: file[name] for name in file.files}
-        meta = json.loads(str(demos.pop("meta")))
+        demos, meta = (read_minari if str(path).startswith(MINARI) else read_file)(path)
         rows, episodes, width = demos["length"].sum(), len(demos["length"]), OBS_DIM[meta["task"]]
         columns = {"obs": (width,), "obs2": (width,), "act": (4,), "executed": (4,)}
         for name in (ROWS | EPISODES).keys() - ({"executed", "effort"} - demos.keys()):
@@ -216,38 +216,122 @@ def load_demos(path, task):
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
     except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
+        raise ValueError(f"{path}: no such {'dataset' if 'Minari' in kind else 'file'}") from None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        lacks = "it lacks " * isinstance(error, KeyError)
-        raise ValueError(f"{path}: not a demonstration file of pid_demo.py --record ({lacks}{error})") from None
-    if meta["task"] != task:
+        raise ValueError(f"{path}: not {kind} ({'it lacks ' * isinstance(error, KeyError)}{error})") from None
+    if task not in (None, meta["task"]):
         raise ValueError(f"{path}: recorded on task {meta['task']}, not {task}")
     return demos, meta
 
 
+def read_file(path):
+    if os.path.isfile(path) and not zipfile.is_zipfile(path):
+        raise ValueError("it is no .npz, or one cut short")
+    with np.load(path, allow_pickle=False) as file:
+        demos = {name: file[name] for name in file.files}
+    return demos, json.loads(str(demos.pop("meta")))
+
+
+def read_minari(path):
+    """A Minari dataset of one of our environments, recorded here or by others: those may lack what is an episode's."""
+    import minari
+
+    dataset = minari.load_dataset(path.removeprefix(MINARI))
+    tasks = {row.env_id: task for task, row in TASKS.items()}
+    meta = {"task": tasks[dataset.env_spec.id], "env_steps": int(dataset.total_steps), "partitions": 4}
+    meta |= {"symmetry": "none"} | json.loads(dataset.storage.metadata.get("demonstrations", "{}"))
+    demos = {name: [] for name in ROWS | EPISODES}
+    for n, found in enumerate(dataset.iterate_episodes()):
+        infos, length = found.infos or {}, len(found.rewards)
+        rows = (found.observations[:-1], infos.get("asked", found.actions), found.rewards, found.observations[1:],
+                found.terminations, found.truncations, np.full(length, n), found.actions)  # fmt: skip
+        of_episode = {"partition": gas.partition_of(found.observations[0], meta["partitions"]), "effort": np.nan}
+        of_episode |= {"success": found.rewards[-1] > kinova_env.R_1 / 2} | {
+            k: infos[k][0] for k in EPISODES if k in infos
+        }
+        for name, value in zip(ROWS, rows, strict=True):
+            demos[name].extend(value)
+        for name, value in (of_episode | {"length": length, "return": sum(found.rewards.tolist())}).items():
+            demos[name].append(value)
+    demos = {name: np.array(demos[name], dtype=dtype) for name, dtype in (ROWS | EPISODES).items()}
+    for name in ["executed"] * ("asked" not in infos) + ["effort"] * ("effort" not in infos):
+        del demos[name]
+    return demos, meta
+
+
+def write_minari(name, demos, meta):
+    """The episodes as a Minari dataset, where Minari keeps them (MINARI_DATASETS_PATH). Its actions are what was done;
+    what was asked for, where that is another thing, and what a demonstration file has an episode are its infos."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    episodes, end = [], 0
+    for n, length in enumerate(demos["length"]):
+        of = {key: demos[key][end : end + length] for key in ROWS if key in demos}
+        infos = {key: np.repeat(demos[key][n], length) for key in ("partition", "success", "effort")}
+        infos |= {"asked": of["act"]} if "executed" in of else {}
+        episodes.append(EpisodeBuffer(
+            observations=np.concatenate((of["obs"], of["obs2"][-1:])), actions=of.get("executed", of["act"]),
+            rewards=of["rew"], terminations=of["terminated"], truncations=of["truncated"], infos=infos))  # fmt: skip
+        end += length
+    spec = gymnasium.spec(TASKS[meta["task"]].env_id)
+    about = dict(algorithm_name="PID", description="Demo-EASE: demonstrations of a PID controller on a Kinova Gen3")
+    with warnings.catch_warnings(action="ignore"):  # that no author is named
+        dataset = minari.create_dataset_from_buffers(name, episodes, env=spec, **about)
+    dataset.storage.update_metadata({"demonstrations": json.dumps(meta)})
+
+
+def given(path, task, symmetry, partitions):
+    """(all that --demos gives under --symmetry, its meta). Raises BadInput that names the flag."""
+    try:
+        demos, meta = load_demos(path, task)
+    except ValueError as error:
+        raise logx.BadInput(f"--demos {error}") from None
+    if "gas" in (symmetry, meta["symmetry"]) and meta["partitions"] != partitions:
+        raise logx.BadInput(f"--demos {path}: of {meta['partitions']} partitions, not --partitions {partitions}")
+    if symmetry == "gas" and meta["symmetry"] != "gas":
+        demos = gas.aggregate(demos, partitions)
+    return demos, meta
+
+
+def all_of(flags, recipe):
+    """How many episodes --demos gives under --symmetry, or the recipe's. Raises BadInput."""
+    demos, _ = given(flags.demos, flags.task, flags.symmetry or recipe["symmetry"], flags.partitions)
+    return len(demos["length"])
+
+
 def demonstrations(flags):
-    """(arrays of N_demos episodes, real environment steps they took): read from flags.demos, a file, else recorded.
+    """(arrays of N_demos episodes, real environment steps they took): read from flags.demos, else recorded.
 
     flags: as of the algorithm scripts. (None, 0) for no demonstrations. Raises BadInput that names the flag.
     """
     if not flags.num_demos:
         return None, 0
-    try:
-        if flags.demos is None:
-            settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+    if flags.demos is None:
+        settings = dict(gains=flags.gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
+        try:
             return record(flags.task, flags.num_demos, **settings, noise=flags.demo_noise, quiet=flags.quiet)
-        demos, meta = load_demos(flags.demos, flags.task)
-    except ValueError as error:
-        raise logx.BadInput(f"--{'demos ' * (flags.demos is not None)}{error}") from None
-    if "gas" in (flags.symmetry, meta["symmetry"]) and meta["partitions"] != flags.partitions:
-        found = meta["partitions"]
-        raise logx.BadInput(f"--demos {flags.demos}: of {found} partitions, not --partitions {flags.partitions}")
-    if flags.symmetry == "gas" and meta["symmetry"] != "gas":
-        demos = gas.aggregate(demos, flags.partitions)
+        except ValueError as error:
+            raise logx.BadInput(f"--{error}") from None
+    demos, meta = given(flags.demos, flags.task, flags.symmetry, flags.partitions)
     found = len(demos["length"])
     if found < flags.num_demos:
         raise logx.BadInput(f"--demos {flags.demos}: gives {found} episodes, fewer than --num_demos {flags.num_demos}")
     return {name: demos[name][demos["episode"] < flags.num_demos] for name in ROWS if name in demos}, meta["env_steps"]
+
+
+def inspect(path):
+    """Prints what a demonstration file holds, by partition."""
+    demos, meta = load_demos(path)
+    settings = ", ".join(f"{key} {value}" for key, value in meta.items() if key not in ("task", "env_steps"))
+    print(f"{path}: {meta['task']}, recorded in {meta['env_steps']:,} steps of the environment; {settings}")
+    print("partition  episodes  success %  steps, median [least, most]   return     |a|")
+    for k in [*np.unique(demos["partition"]), "all"]:
+        of = demos["partition"] == k if k != "all" else np.full(len(demos["partition"]), True)
+        length, a = demos["length"][of], demos["act"][np.isin(demos["episode"], np.flatnonzero(of))]
+        steps = f"{np.median(length):.0f} [{length.min()}, {length.max()}]"
+        print(f"{k!s:>9}  {of.sum():>8}  {100 * demos['success'][of].mean():>9.1f}  {steps:>27}  "
+              f"{demos['return'][of].mean():>7.2f}  {np.abs(a).mean():>6.3f}")  # fmt: skip
 
 
 @dataclasses.dataclass
@@ -258,8 +342,11 @@ class Flags:
     trials: int | None = flag(None, "run N episodes and print mean success, length, ...", low=1, metavar="N")
     watch: bool = flag(False, "three episodes in PyBullet's window")
     gif: Path | None = flag(None, "three episodes into a GIF", metavar="FILE")
+    inspect: str | None = flag(None, "print what a demonstration file, or minari:NAME, holds", metavar="FILE")
 
     out: Path | None = flag(None, "the .npz of --record", metavar="FILE")
+    minari: str | None = flag(None, "the Minari dataset of --record, as kinova/p2p/fast-v0; pip install minari[hdf5]",
+                              metavar="NAME")  # fmt: skip
     gains: str = flag("authors", choices=tuple(GAINS))
     K_P: float | None = flag(None, "instead of that of --gains", low=0)
     K_D: float | None = flag(None, "instead of that of --gains", low=0)
@@ -275,13 +362,16 @@ class Flags:
 
 def check(flags):
     """Raises BadInput where flags do not fit together or a file cannot be written."""
-    jobs = [name for name in ("record", "trials", "watch", "gif") if getattr(flags, name)]
+    asked = ("record", "trials", "watch", "gif", "inspect")
+    jobs = [f"--{name}" for name in asked if getattr(flags, name)]
     if len(jobs) != 1:
-        raise logx.BadInput(f"{' '.join(f'--{job}' for job in jobs)}: give one of --record --trials --watch --gif")
+        raise logx.BadInput(f"{' '.join(jobs)}: give one of --{' --'.join(asked)}")
     if flags.watch and not kinova_env.has_display():
         raise logx.BadInput("--watch: needs a display, and DISPLAY is not set; --gif FILE needs none")
-    if bool(flags.record) != bool(flags.out):
-        raise logx.BadInput("--record and --out: give both or neither")
+    if bool(flags.record) != bool(flags.out or flags.minari):
+        raise logx.BadInput("--record, --out or --minari: --record needs one of the others, and they need it")
+    if flags.minari:
+        check_minari(flags.minari)
     if flags.symmetry == "gas" and flags.stage != "demo":
         raise logx.BadInput(f"--symmetry gas: needs --stage demo, not {flags.stage}")
     for name, suffix in (("out", ""), ("gif", ".gif")):
@@ -290,6 +380,21 @@ def check(flags):
             raise logx.BadInput(f"--{name} {path}: is a folder, or its folder does not exist")
         if path and not path.name.endswith(suffix):
             raise logx.BadInput(f"--{name} {path}: its name must end in {suffix}")
+
+
+def check_minari(name):
+    """Raises BadInput where no Minari dataset can get this name, before anything is recorded for it."""
+    try:
+        import minari
+        from minari.dataset.minari_dataset import parse_dataset_id
+
+        parse_dataset_id(name)
+    except ImportError:
+        raise logx.BadInput(f"--minari {name}: needs pip install 'minari[hdf5]' pillow") from None
+    except (gymnasium.error.Error, TypeError):  # the latter without a version
+        raise logx.BadInput(f"--minari {name}: must be a Minari name, as kinova/p2p/fast-v0") from None
+    if name in minari.list_local_datasets():
+        raise logx.BadInput(f"--minari {name}: there is one already; minari delete {name} removes it")
 
 
 def show(flags, gains):
@@ -315,17 +420,23 @@ def main():
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
     settings |= dict(noise=flags.noise, clearance=flags.clearance)
     try:
+        if flags.inspect:
+            return inspect(flags.inspect)
         if flags.watch or flags.gif:
             return show(flags, gains)
         demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
         if flags.record:
-            meta = json.dumps(dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings))
-            logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **demos, meta=np.array(meta)))
+            meta = dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings)
+            if flags.minari:
+                write_minari(flags.minari, demos, meta)
+            if flags.out:
+                packed = dict(demos, meta=np.array(json.dumps(meta)))
+                logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **packed))
     except OSError as error:
         name = "gif" if flags.gif else "out"
         raise logx.BadInput(f"--{name} {getattr(flags, name)}: cannot be written ({error.strerror or error})") from None
     except ValueError as error:  # sectors too narrow, no display
-        raise logx.BadInput(f"--{'watch: ' * flags.watch}{error}") from None
+        raise logx.BadInput(f"--{'watch: ' * flags.watch}{'inspect ' * bool(flags.inspect)}{error}") from None
     won = demos["success"]
     length = f"{demos['length'][won].mean():.0f} steps" if won.any() else "no success"
     print(
@@ -334,7 +445,7 @@ def main():
         f"effort {demos['effort'].mean():.1f} %, mean |a| {np.abs(demos.get('executed', demos['act'])).mean():.3f}"
     )
     if flags.record:
-        print(f"wrote {flags.out}")
+        print(f"wrote {' and '.join(str(place) for place in (flags.out, flags.minari) if place)}")
 
 
 if __name__ == "__main__":

@@ -37,12 +37,16 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("pnp", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400", low=0)
+    num_demos: int | None = flag(
+        None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400, with --demos: all of them", low=0
+    )
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
-    demos: str | None = flag(None, "a file of pid_demo.py --record instead of own recordings", metavar="FILE")
+    demos: str | None = flag(
+        None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"
+    )
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 2)
     epochs: int = flag(50, "N_ep", low=1)
@@ -96,6 +100,8 @@ def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
     flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
+    if flags.demos and flags.num_demos is None:
+        flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.num_demos), "ppo")
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")

@@ -6,7 +6,7 @@ import json
 import math
 import signal
 import threading
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -466,7 +466,7 @@ def another(field, value):
 
 def test_runs_that_differ_in_any_setting_differ_in_their_variant_and_name(script, tmp_path):
     # off-policy cloning first needs demos_in_B_o, on-policy noise does not go with it; keep_clone needs a clone
-    base = dict(demos_in_B_o=script is ddpg, clone_iters=1)
+    base = dict(demos_in_B_o=script is ddpg, clone_iters=1, num_demos=4)
     plain = script.resolve(script.Flags(**base))
     changed = {field.name: another(field, getattr(plain, field.name)) for field in fields(script.Flags)
                if field.name not in logx.NOT_A_VARIANT | {"demos_in_B_o"}}  # fmt: skip
@@ -504,6 +504,15 @@ def demo_file(tmp_path_factory):
     meta = dict(task="p2p", stage="demo", env_steps=18, gains="fast", seed=3, partitions=4, symmetry="none")
     np.savez_compressed(path, **demo_arrays(), meta=np.array(json.dumps(meta)))
     return str(path)
+
+
+def test_all_demonstrations_of_a_file_are_taken_unless_fewer_are_asked_for(script, demo_file):
+    found = len(demo_arrays()["length"])
+    flags = script.resolve(script.Flags(task="p2p", demos=demo_file, symmetry="none"))
+    assert flags.num_demos == found and f"-N{found}-" in flags.name
+    assert script.resolve(replace(flags, num_demos=2, name=None)).num_demos == 2
+    in_first = int((demo_arrays()["partition"] == 0).sum())
+    assert script.resolve(script.Flags(task="p2p", demos=demo_file, symmetry="gas")).num_demos == 4 * in_first
 
 
 @pytest.mark.parametrize("rule", BAD)

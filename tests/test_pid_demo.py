@@ -432,7 +432,7 @@ def test_pickled_file_is_never_unpickled(tmp_path, good):
 # ---- the command line ------------------------------------------------------------------------------------------------
 
 BAD = [  # arguments ({} is an empty folder), what the line names
-    ("", "--record --trials --watch --gif"),
+    ("", "--record --trials --watch --gif --inspect"),
     ("--trials 1 --gif {}/x.gif", "--trials --gif"),
     ("--record 1", "--out"),
     ("--trials 1 --out {}/x.npz", "--out"),
@@ -444,6 +444,8 @@ BAD = [  # arguments ({} is an empty folder), what the line names
     ("--trials 1 --symmetry gas --stage test", "--stage"),
     ("--trials 1 --partitions 40 --task pnp", "--partitions 40"),
     ("--watch", "--watch: needs a display"),
+    ("--inspect {}/none.npz", "none.npz: no such file"),
+    ("--trials 1 --minari kinova/p2p/fast-v0", "--minari"),
 ]
 
 
@@ -480,6 +482,70 @@ def test_trials_print_success_length_return_and_effort_and_write_nothing(monkeyp
     terms = demos["rew"][under_way] + 2e-3 * np.linalg.norm(demos["obs2"][under_way, INDEX["p2p"]["e"]], axis=1)
     assert effort == pytest.approx(-terms.mean() / 1e-3 * 50, rel=0.1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_inspect_prints_what_a_file_holds_by_partition(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "demos.npz"
+    run(monkeypatch, "--record", 9, "--gains", "fast", "--out", out)
+    demos, meta = load_demos(out)
+    capsys.readouterr()
+    run(monkeypatch, "--inspect", out)
+    first, _, *rows = capsys.readouterr().out.splitlines()
+    assert str(out) in first and f"p2p, recorded in {meta['env_steps']:,} steps" in first
+    rows = {row.split()[0]: row.split() for row in rows}
+    assert set(rows) == {"all", *map(str, set(demos["partition"]))}
+    for name, row in rows.items():
+        of = demos["partition"] == int(name) if name != "all" else slice(None)
+        assert int(row[1]) == len(demos["success"][of]) and float(row[2]) == 100
+        assert float(row[-2]) == pytest.approx(demos["return"][of].mean(), abs=0.006)
+        assert (row[4], row[5]) == (f"[{demos['length'][of].min()},", f"{demos['length'][of].max()}]")
+
+
+@pytest.mark.extras
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_minari_dataset_holds_the_same_demonstrations_and_leads_back_to_the_environment(
+    monkeypatch, tmp_path, capsys, noise
+):
+    import minari
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    out, name = tmp_path / "demos.npz", "kinova/p2p/fast-v0"
+    arguments = ["--record", 3, "--gains", "fast", "--noise", noise, "--minari", name]
+    run(monkeypatch, *arguments, "--out", out)
+    (ours, meta), (theirs, their_meta) = load_demos(out), load_demos(f"minari:{name}")
+    assert meta == their_meta and set(ours) == set(theirs) and ("executed" in ours) == (noise > 0)
+    for key in ours:
+        assert ours[key].dtype == theirs[key].dtype
+        np.testing.assert_array_equal(ours[key], theirs[key])
+    dataset = minari.load_dataset(name)
+    assert dataset.recover_environment(stage="demo").unwrapped.task == "p2p"
+    np.testing.assert_array_equal(dataset[0].actions, ours.get("executed", ours["act"])[: ours["length"][0]])
+    with pytest.raises(logx.BadInput, match=f"--minari {name}: there is one already"):
+        run(monkeypatch, *arguments)
+    with pytest.raises(logx.BadInput, match="--minari fast: must be a Minari name"):
+        run(monkeypatch, *arguments[:-1], "fast")
+    with pytest.raises(ValueError, match="minari:none-v0: no such dataset"):
+        load_demos("minari:none-v0")
+
+
+@pytest.mark.extras
+def test_a_minari_dataset_that_others_recorded_can_be_cloned(monkeypatch, tmp_path):
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    demos, steps = record("p2p", 2, "fast", stage="train")
+    first = demos["length"][0]
+    episode = EpisodeBuffer(
+        observations=np.vstack((demos["obs"][:first], demos["obs2"][first - 1])), actions=demos["act"][:first],
+        rewards=demos["rew"][:first], terminations=demos["terminated"][:first],
+        truncations=demos["truncated"][:first])  # fmt: skip
+    minari.create_dataset_from_buffers("others/reach-v0", [episode], env=gymnasium.spec("KinovaP2P-v0"))
+    found, meta = load_demos("minari:others/reach-v0", "p2p")
+    for key in ROWS.keys() - {"executed"}:
+        np.testing.assert_array_equal(found[key], demos[key][:first])
+    assert found["success"] == [True] and found["return"] == demos["return"][0] and meta["env_steps"] == first
+    assert found["partition"] == [1]  # where the start, pi/4, lies: sectors are centred on -pi/4, pi/4, ...
 
 
 def test_trials_without_a_success_say_so(monkeypatch, capsys):
