@@ -185,6 +185,9 @@ def check_flags(flags):
     return flags
 
 
+# TensorBoard's group of a column, by its first word; of what updates measure, else: "update".
+BOARD = dict(eval="test", EpRet="train", EpLen="train", Success="train", L="loss", epoch="time", env="time",
+             demo="time", seconds="time")  # fmt: skip
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume",
                  "device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard",
@@ -471,8 +474,12 @@ class RunFolder:
         self._since = time.monotonic()
         if self.flags.tensorboard:
             from torch.utils.tensorboard import SummaryWriter
+            from torch.utils.tensorboard.summary import hparams
 
             self._board = SummaryWriter(self.folder)
+            plain = {k: v if isinstance(v, (int, float, str)) else str(v) for k, v in self._config.items()}
+            for part in hparams(plain, {"test/eval_success": 0, "train/EpRet": 0}):
+                self._board.file_writer.add_summary(part)
         quiet = self.flags.quiet
         self._bar = tqdm(total=self.total_steps, initial=start, unit="step", smoothing=0.02, mininterval=1,
                          disable=quiet or None)  # fmt: skip
@@ -558,7 +565,7 @@ class RunFolder:
         self._bar.update(env_steps - self._bar.n)
         for column, v in row.items() if self._board else ():
             if v is not None:
-                self._board.add_scalar(column, v, env_steps)
+                self._board.add_scalar(f"{BOARD.get(column.split('_')[0], 'update')}/{column}", v, env_steps)
 
     def must_save(self, env_steps):
         """Whether a checkpoint is due, or the run was asked to stop."""

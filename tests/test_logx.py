@@ -510,6 +510,20 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path, where):
     assert contents(tmp_path) == {"file": b""}
 
 
+@pytest.mark.extras
+def test_tensorboard_has_every_column_in_a_group_and_the_flags(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    with folder_of(tmp_path / "a", tensorboard=True) as run:
+        run.begin(0)
+        run.log_epoch(10, lambda: {"eval_success": 0.5, "eval_return": 1.0})
+    board = EventAccumulator(str(run.folder))
+    board.Reload()
+    assert {"test/eval_success", "test/eval_return", "time/seconds"} <= set(board.Tags()["scalars"])
+    assert [event.value for event in board.Scalars("test/eval_success")] == [0.5]
+    assert b"lambda_bc" in board.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+
+
 def test_tensorboard_that_is_not_installed_is_refused_and_leaves_no_folder(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(BadInput, match="--tensorboard: needs the tensorboard package"):
