@@ -14,7 +14,9 @@ its own: NAME/evaluation-horizon_600.csv.
 P_scs: successful trials, percent. Over the successful ones: T_eff (Eq. 12),
 100 * mean norm(tau_hat) / 2, percent of the largest possible; R_test, mean
 return; E_95 (Eq. 13), mean norm(e) over the last 5 % of the steps, cm. Trial i
-has the same goal for every agent, start and horizon.
+has the same goal for every agent, start and horizon. --list looks in
+data/results and data/runs beside this file, and in data/runs of the present
+folder, where training writes.
 """
 
 import contextlib
@@ -43,6 +45,8 @@ from film import film
 from kinova_env import OBS_DIM, TASKS, grasped, has_display, start_posture
 from logx import flag
 
+HERE = Path(__file__).resolve().parent
+RESULTS, RUNS = HERE / "data/results", (HERE / "data/runs", Path("data/runs"))  # where runs are looked for
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
 VALIDATION = 10_000  # trials from here on are for choosing; 0 ... 499 are the published ones and choose nothing
 PATHS = 20  # trials whose TCP paths are kept
@@ -371,9 +375,8 @@ def after_training(folder, task, gains, quiet):
 
 
 def print_agents():
-    """Every policy.pt in data/results and data/runs, of this file's folder and of the present one."""
-    data = dict.fromkeys(root / "data" for root in (Path(__file__).resolve().parent, Path.cwd()))
-    places = [folder / name for folder in data for name in ("results", "runs")]
+    """Every policy.pt in RESULTS and RUNS."""
+    places = dict.fromkeys(place.resolve() for place in (RESULTS, *RUNS))
     for path in (path for place in places for path in sorted(place.glob("**/policy.pt"))):
         config, tested = {}, "not tested"
         with contextlib.suppress(OSError, ValueError):

@@ -101,7 +101,7 @@ class RunFlags:
     """The flags of every run, whatever the algorithm."""
 
     name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
-    data_dir: str = flag("data/runs", "where run folders lie")
+    data_dir: str = flag("data/runs", "where run folders lie, from the present folder")
     resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
     device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
     eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)

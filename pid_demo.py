@@ -1,13 +1,16 @@
-"""The PID demonstrator (Eq. 5, Sec. 3.2): watch it, measure it, record its episodes.
+"""The PID demonstrator (Eq. 5, Sec. 3.2): watch it, measure it, record it.
 
-    python pid_demo.py --task p2p --gif pid.gif                     # three episodes as a GIF, no display needed
-    python pid_demo.py --task p2p --watch                           # the same in PyBullet's window
-    python pid_demo.py --task p2p --trials 500 --stage test         # success, length, return, effort
-    python pid_demo.py --task p2p --record 100 --out demos.npz      # episodes for ddpg_demoease.py --demos demos.npz
+    python pid_demo.py --task p2p --gif pid.gif     # a film of three episodes
+    python pid_demo.py --task p2p --watch           # in PyBullet's window
+    python pid_demo.py --task p2p --trials 500 --stage test
+    python pid_demo.py --task p2p --record 100 --out demos.npz
+    python pid_demo.py --inspect demos.npz          # what a file holds
+    python ddpg_demoease.py --demos demos.npz       # trains with it
 
-The controller drives joint angles to the inverse kinematics of Cartesian set points; the action is the reference joint
-velocity in the environment's normalised units. Gains: `authors` is the slow controller as seen of the authors (about
-280 steps on P2P), `fast` reaches in under half the time.
+The controller drives joint angles to the inverse kinematics of Cartesian set
+points; the action is the reference joint velocity in the environment's
+normalised units. Gains: `authors` is the slow controller as seen of the authors
+(about 280 steps on P2P), `fast` reaches in under half the time.
 """
 
 import dataclasses

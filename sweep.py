@@ -9,7 +9,7 @@
 
 Columns are called as the paper's tables vary them: `lambda=1.8`, `demos=160`,
 `baseline`. `--vary` adds lists of values for any flag of the scripts, written
-as in the names of folders (`hidden_sizes=64x64,128x128`, `critic_layernorm=False`).
+as in the names of folders (`hidden_sizes=64x64,128x128`, `hindsight=0,2`).
 
 A run is one command of ddpg_demoease.py or ppo_demoease.py, and the folder that
 this command makes by itself; what it prints goes to log.txt there. The same
@@ -62,7 +62,7 @@ class Flags:
     epochs: int | None = flag(None, "the scripts' --epochs; the recipe's", low=1)
     seeds: int = flag(5, "seeds a column", low=1)
     first_seed: int = flag(0, "the first of them", low=0)
-    data_dir: Path = flag(Path("data/runs"), "where run folders lie")
+    data_dir: Path = flag(Path("data/runs"), "where run folders lie, from the present folder")
     # what to do
     jobs: int | None = flag(None, "runs at a time; 1 here, 256 on Slurm", low=1)
     nice: int = flag(0, "lower priority of the runs on this machine", low=0, high=19)

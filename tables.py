@@ -27,19 +27,17 @@ import zlib
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 import evaluate
 import logx
+from evaluate import HERE, RESULTS, RUNS
 from kinova_env import INDEX, TASKS
 from logx import BadInput
 
-HERE = Path(__file__).resolve().parent
-PAPER, RESULTS = HERE / "data/paper", HERE / "data/results"
-RUNS = (HERE / "data/runs", Path("data/runs"))
+PAPER = HERE / "data/paper"
 TITLES = {"p2p": "P2P", "p2po": "P2P-O", "pnp": "P&P"}
 NUMBERS = {"training": {"p2p": "Table 4", "p2po": "Table 5", "pnp": "Table 3"},
            "test": {"p2p": "Table 6", "p2po": "Table 7", "pnp": "Table 8"}}  # fmt: skip
