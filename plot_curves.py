@@ -19,13 +19,7 @@ is between them in README.md, DIFFERENCES.md and data/results/README.md from
 data/results, and draws the figures there.
 """
 
-import gzip
-import io
-import json
 import math
-import os
-import re
-import shutil
 import textwrap
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,23 +34,21 @@ from matplotlib.figure import Figure  # without pyplot: a PNG is then always dra
 from matplotlib.lines import Line2D
 
 import logx
+import publish
 import tables
 from kinova_env import ACTIVE_JOINTS, EPSILON, RHO, TASKS, TIME_STEP, Z, pybullet
 from logx import BadInput, flag
-from tables import COLUMN, GROUP, HERE, TITLES, group_label, main_group, of_column
+from tables import COLUMN, GROUP, TITLES, group_label, main_group, of_column
 
 FIGURES = Path("figures")
-PAGES = (HERE / "README.md", HERE / "DIFFERENCES.md", HERE / "data/results/README.md")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # Okabe & Ito: safe for colour-blind eyes
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (3, 1, 1, 1)))  # where the colours begin again
 GREEN, GREY, BORDER = COLOURS[2], "#555555", (0, (4, 2))  # the tube of reachable positions, the borders of sectors
 LOOK = {"font.family": "STIXGeneral", "mathtext.fontset": "stix", "font.size": 8, "legend.fontsize": 7,
         "legend.title_fontsize": 7, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
         "axes.titlesize": 8.5, "pdf.fonttype": 42}  # fmt: skip
-DRAWINGS = ("learning", "success", "error", "demos", "trajectories", "partitions", "workspace")
+DRAWINGS = ("learning", "success", "symmetry", "error", "demos", "trajectories", "partitions", "workspace")
 OF_NO_TASK = DRAWINGS[-2:]
-INDEX = ["name", "task", *GROUP[:-1], "num_demos", "lambda_bc", "seed", "env_steps", "finished", "eval_success",
-         "P_scs_percent", "git_commit"]  # fmt: skip
 
 
 @dataclass
@@ -191,6 +183,50 @@ def success_figure(task, runs, flags):
     hidden = len(runs[COLUMN].drop_duplicates()) - len(shown[COLUMN].drop_duplicates())
     caption(figure, "Mean over seeds and its 95 % band (Student). Where lengths alone differ, the longest runs.",
             f"Not drawn: {hidden} other columns; --runs draws all." if hidden else "")  # fmt: skip
+    return figure
+
+
+def symmetry_figure(task, runs, flags):
+    """Test success over the number of real demonstrations, a line a symmetry; and of `gas` over the number of
+    partitions K, at as many real demonstrations and at as many after mapping. Robust runs of most steps."""
+    best = tables.best_column(task)
+    runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
+    runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
+    runs = runs.assign(success=[curves.success for curves in runs.curves]).dropna(subset="success")
+    of_gas = runs.symmetry == "gas"
+    runs["K"] = [
+        curves.config["partitions"] if mapped else 1 for curves, mapped in zip(runs.curves, of_gas, strict=True)
+    ]
+    runs["real"] = -(-runs.num_demos // runs.K)
+    over_K = runs[of_gas]
+    over_n = runs[(runs.variant == "") & (runs.total_env_steps == runs.total_env_steps.mode().max())]
+    if over_n.real.nunique() < 2:
+        return None
+    lines = {"real": dict(list(over_n.groupby("symmetry"))), "K": {}}
+    for fixed, text in (("real", "real demonstrations"), ("num_demos", r"$N_{demos}$")):
+        counts = over_K.groupby(fixed).K.nunique()
+        if counts.max() > 1:  # where most K are
+            n = counts[counts == counts.max()].index[0]
+            lines["K"][f"{n} {text}" if fixed == "real" else f"{text[:-1]}={n}$"] = over_K[over_K[fixed] == n]
+    panels = [x for x in lines if lines[x]]
+    figure = Figure(figsize=(3.2 * len(panels) + 0.8 * (len(panels) == 1), 3.2), layout="constrained")
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for ax, x in zip(axes, panels, strict=True):
+        for i, (label, part) in enumerate(lines[x].items()):
+            values = part.pivot(index="seed", columns=x, values="success")
+            n = sorted(set(values.count()))
+            label += f" ({' to '.join(map(str, dict.fromkeys((n[0], n[-1]))))} seed{'s' * (n[-1] > 1)})"
+            draw_band(ax, values.columns, values.to_numpy(), label, "P_scs_percent", marker=".", **style(i))
+        texts = {"real": "real demonstrations", "K": "number of partitions $K$"}
+        ax.set(xscale="log", xlabel=texts[x], ylim=(-2, 102))
+        ticks = sorted({value for part in lines[x].values() for value in part[x]})
+        ax.set_xticks(ticks, [f"{tick}" for tick in ticks])
+        ax.minorticks_off()
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=1 + (x == "real"))
+    axes[0].set_ylabel("success in test trials (%)")
+    steps = int(over_n.total_env_steps.iloc[0])
+    figure.suptitle(f"{TITLES[task]}: {best.algo.upper()} robust, {steps:,} environment steps", fontsize=9)
+    caption(figure, "Mean over seeds and its 95 % band (Student).")
     return figure
 
 
@@ -394,23 +430,15 @@ def workspace_figure(task=None, runs=None, flags=None):
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-def write(path, content):
-    """A whole file (logx.atomic_write), in a folder that is made where there is none."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        logx.atomic_write(path, content)
-    except OSError as error:
-        raise BadInput(f"{path}: {error.strerror}; a file that can be written is expected") from None
-
-
 def save_figure(name, task, runs, flags, paths, dpi=200):
     """Whether there was something to draw."""
-    runs = tables.of_task(runs, task, variants=bool(flags.runs)) if task else None
+    variants = bool(flags.runs) or name == "symmetry"  # which is K's too
+    runs = tables.of_task(runs, task, variants) if task else None
     with matplotlib.rc_context(LOOK):  # some texts come into being while it is drawn
         figure = globals()[f"{name}_figure"](task, runs, flags)
         for path in paths if figure else ():
             kind, stable = path.suffix[1:], {"CreationDate": None} if path.suffix == ".pdf" else {}
-            write(path, partial(figure.savefig, format=kind, dpi=dpi, metadata=stable))
+            publish.write(path, partial(figure.savefig, format=kind, dpi=dpi, metadata=stable))
             figure.set_layout_engine("none")  # laid out once is enough
     return bool(figure)
 
@@ -431,111 +459,12 @@ def save_figures(folder, runs, flags, ends, dpi=200):
     return names
 
 
-def packed(paths, **arrays):
-    """Bytes of an .npz with TCP paths (tables.read_paths) and `arrays`; positions to half a millimetre."""
-    tcp = np.concatenate([*(path["tcp"] for path in paths), np.empty((0, 3))]).astype(np.float16)
-    rows = {name: np.array([path[name] for path in paths]) for name in ("goal", "object", "success")}
-    rows["length"] = np.array([len(path["tcp"]) - 1 for path in paths])
-    out = io.BytesIO()
-    np.savez_compressed(out, tcp=tcp, **(rows | arrays))
-    return out.getvalue()
-
-
-def files_of_run(folder):
-    """{file name: bytes} that --publish writes of a run. Raises BadInput where it is not whole, or of no commit."""
-    run, flag = tables.Curves(folder), f"--publish {folder}"
-    if folder.resolve().is_relative_to(tables.RESULTS.resolve()):
-        raise BadInput(f"{flag}: is published already")
-    if not re.fullmatch("[0-9a-f]{40}", run.row["commit"]):
-        raise BadInput(f"{flag}: made with git commit {run.row['commit']}; a clean one is expected")
-    if run.pid and "" not in run.evaluations:
-        raise BadInput(f"{flag}: no evaluation.csv; run evaluate.py --pid first")
-    # no path of a machine is published: of each text with folders, or FLAG=FOLDER/NAME, the name stays
-    config = re.sub(r'"([^"/=]*=)?[^"]*/([^"/]*)"', r'"\1\2"', json.dumps(run.config, indent=1))
-    files = {"config.json": config.encode()}
-    if not run.pid:
-        steps, end = run.episodes.env_steps, run.progress.env_steps.max()
-        # an episode may be under way at the end of the last epoch, and a killed run has episodes after it
-        slack = run.episodes.length.max() + run.config.get("max_ep_len", 1000), run.config["steps_per_epoch"]
-        if not (steps == run.episodes.length.cumsum()).all() or not -slack[0] <= steps.max() - end <= slack[1]:
-            raise BadInput(f"{flag}: episodes.csv and progress.csv do not fit together")
-    if (folder / "policy.pt").exists():
-        logx.load_torch(folder / "policy.pt")
-        files["policy.pt"] = (folder / "policy.pt").read_bytes()
-    for path in sorted(folder.glob("*.csv")):
-        files[f"{path.name}.gz"] = gzip.compress(path.read_bytes(), mtime=0)  # the same bytes each time
-    if "" in run.evaluations and run.trajectories.exists() and not run.row["variant"]:  # the successful trials alone
-        won = run.evaluations[""].query("success == 1")
-        errors, (_, paths) = tables.read_errors(run.trajectories), tables.read_paths(run.trajectories)
-        if [len(error) - 1 for error in errors] != won.length.to_list():
-            raise BadInput(f"{flag}: trajectories.npz is not of evaluation.csv's trials; run evaluate.py again")
-        error = np.concatenate([*errors, []]).astype(np.float16)
-        files["trajectories.npz"] = packed([path for path in paths if path["success"]], error=error,
-                                           length=won.length.to_numpy(), success=np.ones(len(won), bool))  # fmt: skip
-    return files
-
-
-def publish(sources):
-    """Copies run folders and demonstration files into data/results, keeps the weights of the best run of each task and
-    recipe, and writes index.csv. Returns remarks."""
-    results, found = tables.RESULTS, {}
-    for path in sources:  # all of them are read before anything is written
-        if path.suffix == ".npz":
-            task, paths = tables.read_paths(path)
-            found[results / f"demos-{task}.npz"] = packed(paths[:40])
-        else:
-            found[results / path.resolve().name] = files_of_run(path)
-    for target, files in found.items():
-        if isinstance(files, bytes):
-            write(target, files)
-            continue
-        part = results / f".{target.name}.part"
-        shutil.rmtree(part, ignore_errors=True)
-        for name, data in reversed(files.items()):  # config.json last: without it, half a copy is no run
-            write(part / name, data)
-        shutil.rmtree(target, ignore_errors=True)
-        os.replace(part, target)
-    rows, best = [], {}
-    for path in sorted(results.glob("[!.]*/config.json")):
-        for run in tables.find_runs([path.parent])[0].to_dict("records"):
-            success, last = run["curves"].success, run["curves"].validation[-1:].max() / 100
-            rows.append({"name": path.parent.name} | run | {
-                "env_steps": run["steps"], "finished": int(run["finished"]), "eval_success": last,
-                "P_scs_percent": success, "git_commit": run["commit"]})  # fmt: skip
-            if (path.parent / "policy.pt").exists():
-                rank = run["variant"] != "", -np.nan_to_num(success, nan=-1), -run["steps"], path.parent.name
-                best.setdefault((run["task"], run["recipe"]), []).append(rank)
-    for *_, name in (rank for ranks in best.values() for rank in sorted(ranks)[1:]):
-        (results / name / "policy.pt").unlink()
-    write(results / "index.csv", pd.DataFrame(rows, columns=INDEX).to_csv(index=False, float_format="%g"))
-    return [*(f"published {target}" for target in found), f"wrote {results / 'index.csv'}, {len(rows)} runs"]
-
-
-# ---- pages -----------------------------------------------------------------------------------------------------------
-
-
-def report():
-    """{page: its text with each marked block made anew from data/results}."""
-    runs, _ = tables.find_runs([tables.RESULTS])
-    figures = sorted(tables.RESULTS.glob("fig-*.png"), key=lambda path: DRAWINGS.index(path.stem.split("-")[1]))
-
-    def block(marks, page):
-        name = marks[1]
-        if name in ("figures", *(f"figures-{task}" for task in TASKS)):
-            shown = [path for path in figures if path.stem.split("-")[2:3] == name.split("-")[1:]]
-            text = "\n\n".join(f"![{path.stem}]({os.path.relpath(path, page.parent)})" for path in shown)
-        elif name in tables.BLOCKS:
-            text = tables.BLOCKS[name](runs)
-        else:
-            raise BadInput(f"{page}: <!-- {name} --> is no block of --report; --help lists them")
-        return f"<!-- {name} -->\n{text}\n<!-- /{name} -->"
-
-    marked = re.compile(r"^<!-- (\S+) -->$.*?^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
-    texts = {page: page.read_text(encoding="utf-8") for page in PAGES if page.exists()}
-    return {page: marked.sub(partial(block, page=page), text) for page, text in texts.items()}
-
-
 # ---- main ------------------------------------------------------------------------------------------------------------
+
+
+def published_figures():
+    """The figures in data/results, in the order of DRAWINGS."""
+    return sorted(tables.RESULTS.glob("fig-*.png"), key=lambda path: DRAWINGS.index(path.stem.split("-")[1]))
 
 
 def draw_all(flags):
@@ -543,8 +472,8 @@ def draw_all(flags):
     runs, remarks = tables.find_runs(flags.runs)
     for kind, task in product((*tables.METRICS, *tables.COMPARED), TASKS):
         text, _, frame = tables.make_table(kind, task, runs, bool(flags.runs))
-        write(flags.all / f"table-{kind}-{task}.txt", text + "\n")
-        write(flags.all / f"table-{kind}-{task}.csv", frame.to_csv(index=False))
+        publish.write(flags.all / f"table-{kind}-{task}.txt", text + "\n")
+        publish.write(flags.all / f"table-{kind}-{task}.csv", frame.to_csv(index=False))
     names = save_figures(flags.all, runs, flags, (".png", ".pdf"))
     remarks.append(f"wrote the tables and {len(names)} figures into {flags.all}")
     return remarks + [line for task in TASKS for line in tables.gaps(task, tables.of_task(runs, task))]
@@ -570,15 +499,15 @@ def main(argv=None):
     flags = logx.parse_flags(Flags, __doc__, argv)
     check(flags)
     if flags.publish:
-        return print("\n".join(publish(flags.publish)))
+        return print("\n".join(publish.publish(flags.publish)))
     if flags.all:
         return print("\n".join(draw_all(flags)))
     if flags.report:
         names = save_figures(tables.RESULTS, tables.find_runs([tables.RESULTS])[0], flags, (".png",), dpi=130)
         for path in set(tables.RESULTS.glob("fig-*.png")) - {tables.RESULTS / f"{name}.png" for name in names}:
             path.unlink()
-        for page, text in report().items():
-            write(page, text)
+        for page, text in publish.report(published_figures()).items():
+            publish.write(page, text)
             print(f"wrote {page}")
         return
     runs, remarks = tables.find_runs(flags.runs) if flags.task else (None, [])
@@ -587,7 +516,7 @@ def main(argv=None):
     if flags.table:
         text, _, frame = tables.make_table(flags.table, flags.task, runs, bool(flags.runs))
         if flags.csv:
-            write(flags.csv, frame.to_csv(index=False))
+            publish.write(flags.csv, frame.to_csv(index=False))
         return print(text, "", *remarks, sep="\n")
     name = "-".join(filter(None, ("fig", flags.figure, flags.task, flags.recipe)))
     paths = [flags.out] if flags.out else [FIGURES / f"{name}{end}" for end in (".png", ".pdf")]

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import plot_curves
+import publish
 import tables
 from logx import BadInput
 from plot_curves import Flags, main
@@ -34,7 +35,7 @@ def folders(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(tables, "RUNS", (tmp_path / "runs",))
     monkeypatch.setattr(plot_curves, "FIGURES", tmp_path / "figures")
-    monkeypatch.setattr(plot_curves, "PAGES", (tmp_path / "README.md", tmp_path / "results/README.md"))
+    monkeypatch.setattr(publish, "PAGES", (tmp_path / "README.md", tmp_path / "results/README.md"))
 
 
 def trials(success):
@@ -77,7 +78,7 @@ def cell(rows, metric, sweep="lambda", num_demos=100, lambda_bc=1.8, evaluation=
 
 
 def figure(name, task="p2p", named=None, **flags):
-    runs = tables.of_task(tables.find_runs(named)[0], task)
+    runs = tables.of_task(tables.find_runs(named)[0], task, variants=name == "symmetry")
     return getattr(plot_curves, f"{name}_figure")(task, runs, Flags(**flags))
 
 
@@ -345,6 +346,27 @@ def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstr
     assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 4
 
 
+def test_the_symmetry_figure_counts_real_demonstrations_and_partitions(tmp_path):
+    one, all_ = (1, 0, 0, 0), (1, 1, 1, 1)
+    for i, (success, config) in enumerate((
+        (one, {"num_demos": 5, "symmetry": "none"}), (all_, {"num_demos": 20, "symmetry": "none"}),
+        (all_, {"num_demos": 20, "symmetry": "gas"}),  # of 4 partitions: 5 real ones
+        (one, {"num_demos": 20, "symmetry": "gas", "seed": 1}),
+        (one, {"num_demos": 10, "symmetry": "gas", "partitions": 2, "variant": "partitions=2"}),  # 5 real ones too
+        (one, {"num_demos": 20, "symmetry": "gas", "partitions": 2, "variant": "partitions=2"}),
+        (all_, {"num_demos": 20, "symmetry": "gas", "variant": "n_step=1"}), (None, {"num_demos": 20}),
+        (one, {"num_demos": 0, "symmetry": "none"}), (one, {"num_demos": 9, "lambda_bc": 1}),
+    )):  # fmt: skip
+        write_run(tmp_path / f"runs/{i}", success=success, **config)
+    over_n, over_K = figure("symmetry").axes
+    lines = {line.get_label(): line.get_xydata().tolist() for ax in (over_n, over_K) for line in ax.lines}
+    assert lines == {"gas (2 seeds)": [[5, 62.5]], "none (1 seed)": [[5, 25], [20, 100]],
+                     "5 real demonstrations (1 to 2 seeds)": [[2, 25], [4, 62.5]],
+                     "$N_{demos}=20$ (1 to 2 seeds)": [[2, 25], [4, 62.5]]}  # fmt: skip
+    shutil.rmtree(tmp_path / "runs/1")
+    assert figure("symmetry") is None  # one count of demonstrations is no curve
+
+
 def test_an_error_curve_is_over_the_successful_trials_and_each_counts_alike_at_every_t(tmp_path):
     write_run(tmp_path / "runs/a", success=(1, 0, 1))  # 3 and 5 steps from 50 to 5 cm
     write_run(tmp_path / "runs/b", success=(0, 0, 1), num_demos=7)
@@ -377,7 +399,7 @@ def write_demos(path, task="p2p"):
 def test_demonstrations_are_drawn_from_a_recording_and_published_as_TCP_paths(tmp_path):
     P_e = write_demos(tmp_path / "d.npz")
     stars = [line.get_marker() for line in figure("demos", demos=tmp_path / "d.npz").axes[0].lines].count("*")
-    plot_curves.publish([tmp_path / "d.npz"])
+    publish.publish([tmp_path / "d.npz"])
     _, paths = tables.read_paths(tmp_path / "results/demos-p2p.npz")
     assert [path["tcp"].tolist() for path in paths] == [P_e[:3].tolist(), P_e[3:].tolist()]
     assert [bool(path["success"]) for path in paths] == [True, False] and np.isnan(paths[0]["object"]).all()
@@ -462,7 +484,7 @@ def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_
 
 def test_what_is_published_makes_the_same_tables_and_figures(tmp_path):
     run = publishable(tmp_path / "x/a", success=(1, 0, 1))
-    plot_curves.publish([run])
+    publish.publish([run])
     for kind in tables.METRICS:
         own, published = (table(kind, named=[folder]).drop(columns="values") for folder in (run, tables.RESULTS))
         pd.testing.assert_frame_equal(own, published)
@@ -476,7 +498,7 @@ def test_only_the_best_run_of_a_task_and_recipe_keeps_its_weights(tmp_path):
     runs.append(publishable(tmp_path / "runs/2", recipe="paper", success=(0, 0), epochs=3))
     runs.append(publishable(tmp_path / "runs/3", success=(1, 1), variant="n_step=1"))
     for run in runs:
-        plot_curves.publish([run])
+        publish.publish([run])
     assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
     assert [row["finished"] for row in index(tmp_path)] == ["1", "1", "0", "1"]
 
@@ -484,7 +506,7 @@ def test_only_the_best_run_of_a_task_and_recipe_keeps_its_weights(tmp_path):
 def test_a_run_takes_the_place_of_an_older_one_of_the_same_name(tmp_path):
     write_run(tmp_path / "results/a", [5.0] * 9)
     (tmp_path / "results/a/agent.gif").write_text("old")
-    plot_curves.publish([publishable(tmp_path / "runs/a")])
+    publish.publish([publishable(tmp_path / "runs/a")])
     assert not (tmp_path / "results/a/agent.gif").exists() and cell(table(), "R90")["mean"] == 1
 
 
@@ -507,7 +529,7 @@ def test_nothing_is_published_where_a_run_is_not_whole_or_of_no_clean_commit(tmp
     good, run = publishable(tmp_path / "runs/good"), publishable(tmp_path / "runs/a", seed=1)
     spoil(run)
     with pytest.raises(BadInput, match=says) as error:
-        plot_curves.publish([good, run])
+        publish.publish([good, run])
     assert str(run) in str(error.value) and not (tmp_path / "results").exists()
 
 
@@ -538,7 +560,7 @@ def test_report_rewrites_the_marked_blocks_from_data_results_and_leaves_the_rest
 
 def test_the_pages_hold_what_the_published_files_say(monkeypatch):
     monkeypatch.undo()  # the real folders
-    for page, text in plot_curves.report().items():
+    for page, text in publish.report(plot_curves.published_figures()).items():
         assert page.read_text() == text, f"{page} is not what python plot_curves.py --report writes"
     assert "<!-- findings -->" in (tables.RESULTS / "README.md").read_text()
 
