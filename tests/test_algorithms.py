@@ -524,6 +524,25 @@ def test_bad_input_is_a_value_error_that_names_the_flag_and_leaves_no_folder(scr
     assert not (tmp_path / "runs").exists() or not list((tmp_path / "runs").iterdir())
 
 
+def test_what_learns_stays_on_the_device_asked(script, monkeypatch):
+    """Without a GPU: on torch's "meta" device, where an operation of two devices is an error. It has no values, so that
+    PPO's update, which stops by them, is not run there."""
+    adam = torch.optim.Adam
+    monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: adam(groups))  # "meta" has no fused one
+    flags = script.resolve(script.Flags(task="pnp", recipe="robust", hidden_sizes=(8, 8), clone_iters=2, quiet=True))
+    learner = script.Learner(replace(flags, device="meta"))
+    if script is ddpg:
+        B = script.ReplayBuffer(25, 20, "mirror")
+        B.filled = 20
+        assert {x.device.type for x in learner.update(B, B)} == {"meta"}
+        learner.clone(B, B)
+    else:
+        B = script.TrajectoryBuffer(25, 20, "mirror")
+        B.filled = 20
+        learner.clone(B, torch.zeros(20))
+    assert {w.device.type for w in learner.net.parameters()} == {"meta"}
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
 def test_cuda_without_a_gpu_is_bad_input(script, tmp_path):
     run = scripted_run(script, tmp_path, "a", device="cuda")
