@@ -62,7 +62,7 @@ class Flags(logx.RunFlags):
     act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
-    q_lr: float = flag(1e-3, "alpha_nu", low=0)
+    q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
     mask: str = flag("q", "q: Eq. 8; none: M = 1", ("q", "none"))
     demos_in_B_o: bool = flag(True, "demonstrations go into B_o too (Sec. 3.3; Alg. 1 prints an empty B_o)")
@@ -70,8 +70,8 @@ class Flags(logx.RunFlags):
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
-    clone_iters: int | None = flag(None, "updates of actor, then critic, before the first step; 0, robust: 2500", low=0)
-    keep_clone: bool | None = flag(None, "L_BC holds own states too, with the first clone's actions, M = 1")
+    clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
+    keep_clone: float | None = flag(None, "weight of staying near that clone in own states; 0, robust: 10", low=0)
     hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
     critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
@@ -82,10 +82,10 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "p2po": dict(epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
-PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=False,
+PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=0.0,
              hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
-ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=2500, keep_clone=True,
-              hindsight=2, updates_per_step=0.25, critic_layernorm=True, start_steps=0)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=10_000,
+              keep_clone=10.0, hindsight=2, updates_per_step=0.25, critic_layernorm=True, start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
 
 
@@ -95,7 +95,7 @@ def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
     defaults = TASK_DEFAULTS[task] | dict(max_ep_len=TASKS[task].horizon, steps_per_epoch=5 * T)
     defaults |= dict(update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
     defaults |= PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task]
-    return defaults | ({"keep_clone": False} if clone_iters == 0 else {})
+    return defaults | ({"keep_clone": 0.0} if clone_iters == 0 else {})
 
 
 def resolve(flags):
@@ -107,10 +107,8 @@ def resolve(flags):
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
     if flags.hindsight and flags.task == "pnp":
         raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp, where a grasp has no goal")
-    if flags.clone_iters and not flags.demos_in_B_o:
-        raise logx.BadInput(f"--clone_iters {flags.clone_iters}: needs demonstrations in B_o, else 0 is allowed")
     if flags.keep_clone and not flags.clone_iters:
-        raise logx.BadInput("--keep_clone: there is no clone at --clone_iters 0; allowed from 1 on")
+        raise logx.BadInput(f"--keep_clone {flags.keep_clone:g}: there is no clone at --clone_iters 0; 0 is allowed")
     return flags
 
 
@@ -284,23 +282,14 @@ class Learner:
             measured = self.update(B_o, B_d)
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
 
-    def critic_loss(self, s, a, r, s2, discount):
-        """(L_C, Q_nu(s, a)) of a batch of B_o."""
-        with torch.no_grad():  # y is a constant: no gradient through the targets
-            y = r + discount * self.target.Q(s2, self.target.pi(s2))
-        Q = self.net.Q(s, a)
-        return loss_C(Q, y), Q
-
-    def step(self):
-        self.optimizer.step()
-        # mu' <- omega mu' + (1 - omega) mu, and nu' alike
-        self.move_targets(list(self.target.parameters()), list(self.net.parameters()), None)
-
     def update(self, B_o, B_d):
         """One gradient step on a batch of B_o and one of B_d (None: no cloning). Returns MEASURED, tensors."""
         f, net = self.flags, self.net
-        s, a, *_ = batch = B_o.sample(f.batch_size, f.device)
-        L_C, Q = self.critic_loss(*batch)
+        s, a, r, s2, discount = B_o.sample(f.batch_size, f.device)
+        with torch.no_grad():  # y is a constant: no gradient through the targets
+            y = r + discount * self.target.Q(s2, self.target.pi(s2))
+        Q = net.Q(s, a)
+        L_C = loss_C(Q, y)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
         u, u_demo = net.mu_net(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
@@ -310,37 +299,37 @@ class Learner:
             Q_demo, Q_own = net.Q(s_demo, a_demo), net.Q(s_demo, a_hat)
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
+        L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
         if f.keep_clone and B_d:
             a_clone = torch.tanh(self.clone_net(s))
-            L_BC = L_BC + loss_BC(a_clone, a_own, torch.ones_like(Q))
-        L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
+            L_A = L_A + f.keep_clone * loss_BC(a_clone, a_own, torch.ones_like(Q))
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
         L_C.backward()
         L_A.backward(inputs=self.mu)
-        self.step()
+        self.optimizer.step()
+        # mu' <- omega mu' + (1 - omega) mu, and nu' alike
+        self.move_targets(list(self.target.parameters()), list(net.parameters()), None)
         return [x.detach() for x in (
             L_O, L_BC, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
             # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
             ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
         )]  # fmt: skip
 
-    def clone(self, B_o, B_d):
-        """Before the first step: clone_iters updates of the actor on B_d, M = 1, then of the critic on B_o."""
+    def clone(self, B_d):
+        """Before the first step: clone_iters updates of the actor on B_d, L_BC with M = 1."""
         f, net = self.flags, self.net
-        for _ in trange(f.clone_iters, desc="actor cloning", disable=f.quiet or None):
-            s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device)
-            L_BC = loss_BC(a_demo, net.pi(s_demo), torch.ones_like(a_demo[:, 0]))
-            self.optimizer.zero_grad()
+        optimizer = torch.optim.Adam(self.mu, lr=f.q_lr, fused=True)
+        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
+        for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
+            s, a, *_ = B_d.sample(f.demo_batch_size, f.device)
+            L_BC = loss_BC(a, net.pi(s), torch.ones_like(a[:, 0]))
+            optimizer.zero_grad()
             L_BC.backward()
-            self.optimizer.step()
+            optimizer.step()
+            decay.step()
         self.target.load_state_dict(net.state_dict())
         self.clone_net.load_state_dict(net.mu_net.state_dict())
-        for _ in trange(f.clone_iters, desc="critic following", disable=f.quiet or None):
-            L_C, _ = self.critic_loss(*B_o.sample(f.batch_size, f.device))
-            self.optimizer.zero_grad()
-            L_C.backward()
-            self.step()
 
     def state(self):
         return {name: getattr(self, name).state_dict() for name in ("net", "target", "clone_net", "optimizer")}
@@ -394,7 +383,7 @@ def loop(f, run):
             if f.demos_in_B_o and len(B_d.rows) > f.replay_size:
                 raise logx.BadInput(f"--replay_size {f.replay_size}: must hold the {len(B_d.rows)} demonstrated steps")
             store_demonstrations(demos, B_o, B_d, f)
-            learner.clone(B_o, B_d)
+            learner.clone(B_d)
     run.begin(demo_env_steps)
 
     while t < run.total_steps:

@@ -22,7 +22,6 @@ folder, where training writes.
 import contextlib
 import csv
 import gzip
-import importlib.util
 import io
 import json
 import math
@@ -38,11 +37,11 @@ import gymnasium
 import numpy as np
 from tqdm import tqdm
 
+import film
 import gas
 import logx
 import pid_demo
-from film import film
-from kinova_env import OBS_DIM, TASKS, grasped, has_display, start_posture
+from kinova_env import OBS_DIM, TASKS, grasped, start_posture
 from logx import flag
 
 HERE = Path(__file__).resolve().parent
@@ -71,7 +70,7 @@ class Flags:
     jobs: int = flag(1, "worker processes", low=1)
     versus: Path | None = flag(None, "print the differences from this run too, over the same trials", metavar="RUN")
     gif: Path | None = flag(None, "film trials instead, the agents side by side; FILE.gif, or FILE.mp4 (pip install "
-                            "imageio imageio-ffmpeg)", metavar="FILE")  # fmt: skip
+                            "-e '.[video]')", metavar="FILE")  # fmt: skip
     watch: bool = flag(False, "trials in PyBullet's window instead")
     show: tuple[int, ...] | None = flag(None, "numbers of the trials to film (the first 6) or watch (3)", low=0)
 
@@ -355,7 +354,7 @@ def show(agents, numbers, path=None, **settings):
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
     made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
-        film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers})
+        film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers})
         print(f"wrote {path}")
     for i in () if path else numbers:
         row, *_ = trial(*made[next(iter(made))], i)
@@ -395,18 +394,13 @@ def print_agents():
 
 def check(flags):
     """{name: (task, source)} of what the flags name. Raises logx.BadInput."""
-    gif, of_pid = flags.gif, flags.task or flags.gains or flags.out
-    no_video = not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg")))
+    film.check(flags.gif, flags.watch)
+    of_pid = flags.task or flags.gains or flags.out
     for wrong, message in (
         (not (flags.pid or flags.runs), "RUN: name run folders (--list prints some), or --pid --task T"),
         (flags.pid and not flags.task, f"--pid: needs --task, one of {', '.join(TASKS)}"),
         (of_pid and not flags.pid, f"--task, --gains, --out {of_pid}: go with --pid; a run has its own"),
-        (gif and gif.suffix not in (".gif", ".mp4"), f"--gif {gif}: must end in .gif or .mp4"),
-        (gif and (gif.is_dir() or not gif.absolute().parent.is_dir()), f"--gif {gif}: must be a file in a folder"),
-        (gif and gif.suffix == ".mp4" and no_video, f"--gif {gif}: needs pip install imageio imageio-ffmpeg"),
-        (gif and flags.watch, "--gif, --watch: one of them at a time"),
-        (flags.watch and not has_display(), "--watch: needs a display, and DISPLAY is not set; --gif FILE needs none"),
-        (flags.show and not (gif or flags.watch), "--show: goes with --gif or --watch; --first_trial else"),
+        (flags.show and not (flags.gif or flags.watch), "--show: goes with --gif or --watch; --first_trial else"),
         (flags.watch and len(flags.runs) + flags.pid + bool(flags.versus) > 1, "--watch: one agent at a time"),
     ):
         if wrong:
@@ -420,7 +414,7 @@ def check(flags):
     if flags.pid:
         agents[f"PID, {flags.gains or 'authors'} gains, {flags.task}"] = flags.task, flags.gains or "authors"
     tasks = sorted({task for task, _ in agents.values()})
-    if len(tasks) > 1 and (flags.versus or gif):
+    if len(tasks) > 1 and (flags.versus or flags.gif):
         raise logx.BadInput(f"--versus, --gif: the agents must be of one task, not {' and '.join(tasks)}")
     return agents
 

@@ -5,6 +5,7 @@
 
 import contextlib
 import ctypes
+import importlib.util
 import math
 import os
 import sys
@@ -16,7 +17,7 @@ import logx
 
 FLOOR = Path(__file__).parent / "data" / "robot" / "floor.png"
 ORANGE, GREEN, RED = (0.84, 0.37, 0.0), (0.0, 0.62, 0.45), (0.80, 0.15, 0.15)
-CAMERA = dict(distance=1.5, yaw=38, pitch=-20)  # degrees, m
+CAMERA = dict(distance=1.5, yaw=38, pitch=-20)  # m, degrees
 TARGET = (0, 0, 0.4)  # that the camera looks at
 FIELD, NEAR, FAR = 42, 0.1, 5.0  # of view, degrees; clipping planes, m
 LIGHT = np.array([0.3, -0.4, 2.0])  # from where: nearly above, so that a shadow lies under what throws it
@@ -44,6 +45,21 @@ def silence(*streams):
 
 with silence(2):  # its build time
     import pybullet
+
+
+def has_display():
+    """Whether PyBullet can open its window; where it cannot it would end the process."""
+    if not sys.platform.startswith("linux"):
+        return True
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    display = x11.XOpenDisplay(None)
+    if display:
+        x11.XCloseDisplay(display)
+    return bool(display)
 
 
 def furnish(client, robot, window, radius):
@@ -95,14 +111,14 @@ def open_window():
 
 
 def picture(client, width, height, goal, radius):
-    """(height, width, 3) uint8 of the scene, with the goal (3,) in m as a translucent ball."""
+    """(height, width, 3) uint8 of the scene, with the goal (3,) in m, or None, as a translucent ball."""
     w, h = SMOOTH * width, SMOOTH * height
     view = pybullet.computeViewMatrixFromYawPitchRoll(TARGET, roll=0, upAxisIndex=2, **CAMERA)
     lens = pybullet.computeProjectionMatrixFOV(FIELD, width / height, NEAR, FAR)
     look = dict(lightDirection=LIGHT.tolist(), lightDistance=5, lightAmbientCoeff=0.6, lightDiffuseCoeff=0.42,
                 lightSpecularCoeff=0.05, shadow=1, renderer=pybullet.ER_TINY_RENDERER)  # fmt: skip
     *_, rgba, depth, _ = pybullet.getCameraImage(w, h, view, lens, **look, physicsClientId=client)
-    rgb = np.asarray(rgba, dtype=np.float32).reshape(h, w, 4)[..., :3].copy()
+    rgb = np.asarray(rgba, dtype=np.float32).reshape(h, w, 4)[..., :3]
     if goal is not None:
         depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.reshape(depth, (h, w)))  # of the buffer, to m
         _ball(rgb, depth, np.reshape(view, (4, 4)).T, np.reshape(lens, (4, 4)), goal, radius)
@@ -128,11 +144,26 @@ def _ball(rgb, depth, view, lens, centre, radius, alpha=0.6):
 
 
 def short(names):
-    """The names without folders and without the parts, between dashes, that all of them have."""
+    """The names without folders and without the parts, between dashes, that all of them have; with these where there
+    is one name, or two would become alike."""
     parts = [Path(name).name.split("-") for name in names]
     shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set()
     kept = ["-".join(part for part in name if part not in shared) for name in parts]
     return kept if all(kept) and len(set(kept)) == len(kept) else ["-".join(name) for name in parts]
+
+
+def check(path, watch):
+    """Raises logx.BadInput where no film can be written to `path`, or a window is asked for that cannot be opened."""
+    no_video = not all(map(importlib.util.find_spec, ("imageio", "imageio_ffmpeg")))
+    for wrong, message in (
+        (watch and path, "--gif, --watch: one of them at a time"),
+        (watch and not has_display(), "--watch: needs a display, and there is none; --gif FILE needs none"),
+        (path and path.suffix not in (".gif", ".mp4"), f"--gif {path}: must end in .gif or .mp4"),
+        (path and (path.is_dir() or not path.absolute().parent.is_dir()), f"--gif {path}: must be a file in a folder"),
+        (path and path.suffix == ".mp4" and no_video, f"--gif {path}: needs pip install -e '.[video]'"),
+    ):
+        if wrong:
+            raise logx.BadInput(message)
 
 
 def frames(agents, episodes, every=EVERY):

@@ -10,8 +10,6 @@ The class docstring of `KinovaEnv` says what goes in and what comes out. Importi
 
 import contextlib
 import math
-import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,11 +86,6 @@ SIDE = 0.006375 + 2 * 0.00017505 - 0.005375  # the TCP lies this far to the left
 TIME_STEP = 0.02  # s: 50 Hz, one physics step per action
 CUBE_SIZE = 0.04  # m
 STAGES = ("train", "demo", "test")
-
-
-def has_display():
-    """Whether PyBullet can open its window."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
 def tcp(q):
@@ -268,7 +261,7 @@ class KinovaEnv(gymnasium.Env):
     """
 
     # "human" where there is a screen
-    metadata = {"render_modes": ["human"] * has_display() + ["rgb_array"], "render_fps": 50}
+    metadata = {"render_modes": ["human"] * film.has_display() + ["rgb_array"], "render_fps": 50}
 
     def __init__(self, task="p2p", stage="train", partitions=4, render_mode=None, width=640, height=480):
         if task not in TASKS:
@@ -279,8 +272,8 @@ class KinovaEnv(gymnasium.Env):
             raise ValueError(f"partitions {partitions!r}: must be a whole number of at least 1")
         if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode {render_mode!r}: must be None, 'human' or 'rgb_array'")
-        if render_mode == "human" and not has_display():
-            raise ValueError("render_mode 'human': needs a display, and DISPLAY is not set; use 'rgb_array'")
+        if render_mode == "human" and not film.has_display():
+            raise ValueError("render_mode 'human': needs a display, and there is none; use 'rgb_array'")
         self.task, self.stage, self.partitions = task, stage, partitions
         self.row = TASKS[task]
         self.render_mode, self.width, self.height = render_mode, width, height

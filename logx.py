@@ -154,7 +154,9 @@ def parse_flags(cls, doc, argv=None):
         parser.add_argument(field.name if about["positional"] else f"--{field.name}", **options)
     values, unknown = parser.parse_known_args(argv)
     if unknown:
-        raise BadInput(_no_such_flag(unknown[0], [f"--{field.name}" for field in dataclasses.fields(cls)]))
+        raise BadInput(
+            _no_such_flag(unknown[0], [f"--{field.name}" for field in dataclasses.fields(cls) if field.metadata])
+        )
     for name, value in vars(values).items():
         setattr(values, name, tuple(value) if isinstance(value, list) else value)
     return check_flags(cls(**vars(values)))

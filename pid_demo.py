@@ -26,10 +26,10 @@ import gymnasium
 import numpy as np
 from tqdm import tqdm
 
+import film
 import gas
 import kinova_env
 import logx
-from film import film
 from kinova_env import EPSILON, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
@@ -218,9 +218,12 @@ def load_demos(path, task=None):
                 raise ValueError(f"nan or inf in its {name}")
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
+    except ImportError:
+        raise ValueError(f"{path}: needs pip install -e '.[minari]'") from None
     except FileNotFoundError:
         raise ValueError(f"{path}: no such {'dataset' if 'Minari' in kind else 'file'}") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, zipfile.BadZipFile,
+            zlib.error) as error:  # fmt: skip
         raise ValueError(f"{path}: not {kind} ({'it lacks ' * isinstance(error, KeyError)}{error})") from None
     if task not in (None, meta["task"]):
         raise ValueError(f"{path}: recorded on task {meta['task']}, not {task}")
@@ -243,6 +246,8 @@ def read_minari(path):
     tasks = {row.env_id: task for task, row in TASKS.items()}
     meta = {"task": tasks[dataset.env_spec.id], "env_steps": int(dataset.total_steps), "partitions": 4}
     meta |= {"symmetry": "none"} | json.loads(dataset.storage.metadata.get("demonstrations", "{}"))
+    if not dataset.total_episodes:
+        raise ValueError("it has no episode")
     demos = {name: [] for name in ROWS | EPISODES}
     for n, found in enumerate(dataset.iterate_episodes()):
         infos, length = found.infos or {}, len(found.rewards)
@@ -304,7 +309,8 @@ def all_of(flags, recipe):
 
 
 def demonstrations(flags):
-    """(arrays of N_demos episodes, real environment steps they took): read from flags.demos, else recorded.
+    """(arrays of N_demos episodes, real environment steps they took; of a file, all that it took): those of
+    flags.demos, else recorded.
 
     flags: as of the algorithm scripts. (None, 0) for no demonstrations. Raises BadInput that names the flag.
     """
@@ -344,11 +350,11 @@ class Flags:
     record: int | None = flag(None, "record N episodes into --out", low=1, metavar="N")
     trials: int | None = flag(None, "run N episodes and print mean success, length, ...", low=1, metavar="N")
     watch: bool = flag(False, "three episodes in PyBullet's window")
-    gif: Path | None = flag(None, "three episodes into a GIF", metavar="FILE")
+    gif: Path | None = flag(None, "three episodes into a GIF, or an MP4 (pip install -e '.[video]')", metavar="FILE")
     inspect: str | None = flag(None, "print what a demonstration file, or minari:NAME, holds", metavar="FILE")
 
     out: Path | None = flag(None, "the .npz of --record", metavar="FILE")
-    minari: str | None = flag(None, "the Minari dataset of --record, as kinova/p2p/fast-v0; pip install minari[hdf5]",
+    minari: str | None = flag(None, "the Minari dataset of --record, as kinova/p2p/fast-v0; pip install -e '.[minari]'",
                               metavar="NAME")  # fmt: skip
     gains: str = flag("authors", choices=tuple(GAINS))
     K_P: float | None = flag(None, "instead of that of --gains", low=0)
@@ -369,20 +375,15 @@ def check(flags):
     jobs = [f"--{name}" for name in asked if getattr(flags, name)]
     if len(jobs) != 1:
         raise logx.BadInput(f"{' '.join(jobs)}: give one of --{' --'.join(asked)}")
-    if flags.watch and not kinova_env.has_display():
-        raise logx.BadInput("--watch: needs a display, and DISPLAY is not set; --gif FILE needs none")
+    film.check(flags.gif, flags.watch)
     if bool(flags.record) != bool(flags.out or flags.minari):
         raise logx.BadInput("--record, --out or --minari: --record needs one of the others, and they need it")
     if flags.minari:
         check_minari(flags.minari)
     if flags.symmetry == "gas" and flags.stage != "demo":
         raise logx.BadInput(f"--symmetry gas: needs --stage demo, not {flags.stage}")
-    for name, suffix in (("out", ""), ("gif", ".gif")):
-        path = getattr(flags, name)
-        if path and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise logx.BadInput(f"--{name} {path}: is a folder, or its folder does not exist")
-        if path and not path.name.endswith(suffix):
-            raise logx.BadInput(f"--{name} {path}: its name must end in {suffix}")
+    if flags.out and (flags.out.is_dir() or not flags.out.absolute().parent.is_dir()):
+        raise logx.BadInput(f"--out {flags.out}: must be a file in a folder")
 
 
 def check_minari(name):
@@ -392,11 +393,14 @@ def check_minari(name):
         from minari.dataset.minari_dataset import parse_dataset_id
 
         parse_dataset_id(name)
+        taken = name in minari.list_local_datasets()
     except ImportError:
-        raise logx.BadInput(f"--minari {name}: needs pip install 'minari[hdf5]' pillow") from None
+        raise logx.BadInput(f"--minari {name}: needs pip install -e '.[minari]'") from None
     except (gymnasium.error.Error, TypeError):  # the latter without a version
         raise logx.BadInput(f"--minari {name}: must be a Minari name, as kinova/p2p/fast-v0") from None
-    if name in minari.list_local_datasets():
+    except OSError as error:
+        raise logx.BadInput(f"--minari {name}: {error.filename} cannot be read ({error.strerror})") from None
+    if taken:
         raise logx.BadInput(f"--minari {name}: there is one already; minari delete {name} removes it")
 
 
@@ -406,7 +410,7 @@ def show(flags, gains):
     env = gymnasium.make(TASKS[flags.task].env_id, render_mode="rgb_array" if flags.gif else "human", **settings)
     pid, seeds = PID(env, gains, flags.clearance), range(flags.seed, flags.seed + 3)
     if flags.gif:
-        film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
+        film.film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
         print(f"wrote {flags.gif}")
     for seed in () if flags.gif else seeds:
         env.reset(seed=seed)
@@ -436,7 +440,7 @@ def main():
                 packed = dict(demos, meta=np.array(json.dumps(meta)))
                 logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **packed))
     except OSError as error:
-        name = "gif" if flags.gif else "out"
+        name = next(name for name in ("gif", "out", "minari") if getattr(flags, name))
         raise logx.BadInput(f"--{name} {getattr(flags, name)}: cannot be written ({error.strerror or error})") from None
     except ValueError as error:  # sectors too narrow, no display
         raise logx.BadInput(f"--{'watch: ' * flags.watch}{'inspect ' * bool(flags.inspect)}{error}") from None

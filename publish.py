@@ -79,9 +79,13 @@ def publish(sources):
     """Copies run folders and demonstration files into data/results, keeps the weights of the best run of each task and
     recipe, and writes index.csv. Returns remarks."""
     results, found = tables.RESULTS, {}
+    if twins := {path.name for path in sources if [other.name for other in sources].count(path.name) > 1}:
+        raise BadInput(f"--publish: two are called {min(twins)}; one would replace the other")
     for path in sources:  # all of them are read before anything is written
         if path.suffix == ".npz":
             task, paths = tables.read_paths(path)
+            if not task:
+                raise BadInput(f"--publish {path}: a file of pid_demo.py --record is expected")
             found[results / f"demos-{task}.npz"] = packed(paths[:40])
         else:
             found[results / path.resolve().name] = files_of_run(path)

@@ -13,7 +13,7 @@ begins anew with --resume.
 It is also an example of how the environment is used with another library.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gymnasium
 import torch
@@ -35,12 +35,15 @@ class Flags(logx.RunFlags):
     seed: int = flag(0, "of all that is random", low=0, high=2**32 - 1)
     epochs: int = flag(100, "of 1000 steps", low=1)
     act_noise: float = flag(0.1, "of td3 and ddpg, which have none of their own", low=0)
-    # what tables and the recording of demonstrations ask for
+    resume: bool = flag(False, "begin an interrupted run anew")
+    # of the other scripts, or what tables and the recording of demonstrations ask for
+    quick: bool = False
+    checkpoint_every: int = 5
     steps_per_epoch: int = 1000
     recipe: str = "sb3"
     symmetry: str = "none"
     lambda_bc: float = 0.0
-    max_ep_len: int = 0  # T
+    max_ep_len: int | None = None  # T
     partitions: int = 4
     gains: str | None = "fast"
     demo_noise: float | None = 0.2
@@ -49,8 +52,9 @@ class Flags(logx.RunFlags):
 
 def resolve(flags):
     """The flags, with a name. Raises logx.BadInput."""
-    flags = replace(logx.check_flags(flags), max_ep_len=TASKS[flags.task].horizon)
-    defaults = {"algo": flags.algo, "max_ep_len": flags.max_ep_len, "n_step": 10 if flags.num_demos else 1}
+    flags = logx.check_flags(flags)
+    T = TASKS[flags.task].horizon
+    defaults = {"algo": flags.algo, "max_ep_len": T, "n_step": 10 if flags.num_demos else 1}
     return logx.fill_in(flags, defaults, flags.algo)
 
 
@@ -107,13 +111,15 @@ def train(flags):
     f = resolve(flags)
     with logx.RunFolder(f, f.algo, []) as run:
         if not run.finished():
+            if run.checkpoint:
+                raise logx.BadInput(f"--epochs {f.epochs}: a finished run cannot go on; begin a new --name")
             demos, steps = pid_demo.demonstrations(f)
             model = make_model(f)
             if demos:
                 preload(model, demos)
             run.begin(steps)
             model.learn(run.total_steps, callback=Record())
-            if run.stop_signals:
+            if model.num_timesteps < run.total_steps:
                 raise KeyboardInterrupt(f"{run.folder}: stopped; --resume begins it anew")
             run.save({"t": run.total_steps}, pack_policy(model, f.task))
     return run.folder

@@ -528,14 +528,16 @@ def test_what_learns_stays_on_the_device_asked(script, monkeypatch):
     """Without a GPU: on torch's "meta" device, where an operation of two devices is an error. It has no values, so that
     PPO's update, which stops by them, is not run there."""
     adam = torch.optim.Adam
-    monkeypatch.setattr(torch.optim, "Adam", lambda groups, fused: adam(groups))  # "meta" has no fused one
+    monkeypatch.setattr(
+        torch.optim, "Adam", lambda *args, fused, **more: adam(*args, **more)
+    )  # "meta" has no fused one
     flags = script.resolve(script.Flags(task="pnp", recipe="robust", hidden_sizes=(8, 8), clone_iters=2, quiet=True))
     learner = script.Learner(replace(flags, device="meta"))
     if script is ddpg:
         B = script.ReplayBuffer(25, 20, "mirror")
         B.filled = 20
         assert {x.device.type for x in learner.update(B, B)} == {"meta"}
-        learner.clone(B, B)
+        learner.clone(B)
     else:
         B = script.TrajectoryBuffer(25, 20, "mirror")
         B.filled = 20

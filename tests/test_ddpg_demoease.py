@@ -55,10 +55,10 @@ def random_batch(n, obs_dim=22):
 
 
 class Paper:
-    """Alg. 1 with Eq. 6 to 8 in plain autograd and two torch.optim.Adam. keep_clone: Eq. 7 of states of B_o too, with
-    the clone's action and M = 1. Shares nothing with the source but the weights it starts from."""
+    """Alg. 1 with Eq. 6 to 8 in plain autograd and two torch.optim.Adam. keep_clone: weight of Eq. 7 of states of B_o,
+    with the clone's action and M = 1. Shares nothing with the source but the weights it starts from."""
 
-    def __init__(self, learner, omega, lambda_bc, pi_lr, q_lr, masked=True, keep_clone=False):
+    def __init__(self, learner, omega, lambda_bc, pi_lr, q_lr, masked=True, keep_clone=0.0):
         self.omega, self.lambda_bc, self.masked, self.keep_clone = omega, lambda_bc, masked, keep_clone
 
         def copy_of(source):
@@ -77,7 +77,7 @@ class Paper:
         self.pairs = [(self.u, learner.net.mu_net), (self.u_target, learner.target.mu_net)]
         self.pairs += [(self.q, learner.net.q_net), (self.q_target, learner.target.q_net)]
 
-    def update(self, batch, demo, hold_actor=False):
+    def update(self, batch, demo):
         """One step. batch: (s, a, r, s2, discount), demo: (s, a) or None. Returns its figures, floats by name."""
         s, a, r, s2, discount = batch
 
@@ -99,14 +99,13 @@ class Paper:
         if demo is not None:
             s_d, a_d = demo
             L_BC, M, a_hat = cloned(s_d, a_d, self.masked)
-            if self.keep_clone:
-                L_BC = L_BC + cloned(s, torch.tanh(self.u_clone(s)).detach(), False)[0]
-            L_A = self.lambda_bc * L_BC + L_O
+            L_keep, *_ = cloned(s, torch.tanh(self.u_clone(s)).detach(), False)
+            L_A = self.lambda_bc * L_BC + L_O + self.keep_clone * L_keep
             figures |= {"L_BC": L_BC, "mask_fraction": M.float().mean(), "pretanh_demo": self.u(s_d).abs().mean(),
                         "bc_relative_error": torch.mean((a_d - a_hat) ** 2) / torch.mean(a_d**2)}  # fmt: skip
-        for adam, L, parameters in ((self.adam_mu, L_A, self.mu), (self.adam_nu, L_C, self.nu)):
+        for L, parameters in ((L_A, self.mu), (L_C, self.nu)):
             for p, g in zip(parameters, torch.autograd.grad(L, parameters, retain_graph=True), strict=True):
-                p.grad = None if hold_actor and adam is self.adam_mu else g
+                p.grad = g
         self.adam_mu.step()
         self.adam_nu.step()
         with torch.no_grad():
@@ -121,7 +120,7 @@ class Paper:
                 torch.testing.assert_close(q.detach(), p.detach(), rtol=0, atol=2e-5)
 
 
-def learner_and_paper(masked=True, keep_clone=False, **changes):
+def learner_and_paper(masked=True, keep_clone=0.0, **changes):
     torch.manual_seed(1)
     flags = resolve(hidden_sizes=(24, 40, 16), polyak=0.8, lambda_bc=1.3, pi_lr=2e-3, q_lr=5e-3, symmetry="none",
                     mask="q" if masked else "none", keep_clone=keep_clone, **changes)  # fmt: skip
@@ -130,7 +129,7 @@ def learner_and_paper(masked=True, keep_clone=False, **changes):
 
 
 @pytest.mark.parametrize("masked, keep_clone, with_demos", [
-    (True, False, True), (False, False, True), (True, True, True), (False, True, True), (True, False, False),
+    (True, 0.0, True), (False, 0.0, True), (True, 3.0, True), (False, 3.0, True), (True, 0.0, False),
 ], ids=["as published", "no mask", "clone kept", "clone kept, no mask", "no demonstrations"])  # fmt: skip
 def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(masked, keep_clone, with_demos):
     learner, paper = learner_and_paper(masked, keep_clone, clone_iters=1)
@@ -148,19 +147,23 @@ def test_updates_are_those_of_a_plain_reimplementation_of_the_paper(masked, keep
         assert min(fractions) > 0 and max(fractions) < 1 if masked else fractions == [1] * 6
 
 
-def test_cloning_first_fits_the_actor_without_a_mask_and_then_the_critic_to_it():
+def test_cloning_first_fits_the_actor_alone_without_a_mask_at_a_rate_that_falls_to_0():
     learner, paper = learner_and_paper(clone_iters=5)
-    batch, demo = random_batch(48), random_batch(30)
-    learner.clone(Fixed(*batch), Fixed(*demo))
-    for _ in range(5):
+    before = [p.clone() for p in learner.net.q_net.parameters()]
+    demo = random_batch(30)
+    learner.clone(Fixed(*demo))
+    adam = torch.optim.Adam(paper.mu, lr=5e-3)
+    for n in range(5):
+        adam.param_groups[0]["lr"] = 5e-3 * (1 + math.cos(math.pi * n / 5)) / 2
         loss = torch.mean((torch.tanh(paper.u(demo[0])) - demo[1]) ** 2)
         for p, g in zip(paper.mu, torch.autograd.grad(loss, paper.mu), strict=True):
             p.grad = g
-        paper.adam_mu.step()
+        adam.step()
     paper.u_target.load_state_dict(paper.u.state_dict())
-    for _ in range(5):
-        paper.update(batch, demo[:2], hold_actor=True)
     paper.assert_same_weights()
+    for p, q in zip(learner.clone_net.parameters(), learner.net.mu_net.parameters(), strict=True):
+        assert torch.equal(p, q)
+    assert all(map(torch.equal, before, learner.net.q_net.parameters()))
 
 
 def test_the_mask_picks_the_rows_where_the_demonstrated_action_is_worth_more():
@@ -435,7 +438,7 @@ DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 
 }  # fmt: skip
 AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1,
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
-                    clone_iters=0, keep_clone=False, hindsight=0, critic_layernorm=False,
+                    clone_iters=0, keep_clone=0.0, hindsight=0, critic_layernorm=False,
                     updates_per_step=1)  # fmt: skip
 
 
@@ -455,10 +458,9 @@ def test_a_very_short_episode_still_updates():
 
 @pytest.mark.parametrize("flags, says", [
     (dict(task="pnp", hindsight=1), "--hindsight 1: 0 is allowed on --task pnp"),
-    (dict(clone_iters=1, demos_in_B_o=False), "--clone_iters 1"),
-    (dict(keep_clone=True), "--keep_clone: there is no clone at --clone_iters 0"),
+    (dict(keep_clone=1.0), "--keep_clone 1: there is no clone at --clone_iters 0"),
     (dict(num_demos=4, replay_size=10), "--replay_size 10: must hold the 18 demonstrated steps"),
-], ids=["hindsight with a cube to grasp", "cloning first without B_o", "no clone", "B_o too small"])  # fmt: skip
+], ids=["hindsight with a cube to grasp", "no clone", "B_o too small"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ddpg, tmp_path, "a", recorded=demo_arrays(), **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()

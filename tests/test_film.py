@@ -1,12 +1,12 @@
 """film.py: what GIFs show, and that they show it in real time."""
 
-import gymnasium
+from functools import partial
+
 import numpy as np
 import pytest
 from PIL import Image
 
 import film
-from kinova_env import TASKS
 
 START, GOAL = (-0.8, 0.5, 0.45), (0.3, 0.5, 0.45)
 
@@ -16,16 +16,8 @@ def still(obs):
 
 
 @pytest.fixture
-def make():
-    made = []
-
-    def make(task="p2p", width=96, height=72, **settings):
-        made.append(gymnasium.make(TASKS[task].env_id, render_mode="rgb_array", width=width, height=height, **settings))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+def make(make):
+    return partial(make, render_mode="rgb_array", width=96, height=72)
 
 
 def near(picture, colour, within=40):
@@ -86,15 +78,15 @@ def test_the_goal_is_a_ball_one_sees_through_and_that_what_is_before_it_hides(ma
 
     def ball(**other):
         env.reset(seed=0, options=options | other)
-        with_goal, goal = env.render().astype(int), env.unwrapped.goal
+        with_goal = env.render().astype(int)
         env.unwrapped.goal = None
-        return np.abs(with_goal - env.render()).max(-1) > 8, with_goal, goal
+        return np.abs(with_goal - env.render()).max(-1) > 8, with_goal
 
-    changed, picture, _ = ball()
+    changed, picture = ball()
     across = np.flatnonzero(changed.any(0)), np.flatnonzero(changed.any(1))
     assert abs(np.ptp(across[0]) - np.ptp(across[1])) <= 2  # round, but for perspective
     assert near(picture, film.GREEN, 60)[changed].sum() < changed.sum() / 2  # the floor shines through
-    behind, *_ = ball(goal=(np.pi / 2 + np.radians(38) + 0.15, 0.3, 0.45))  # half behind the column
+    behind, _ = ball(goal=(np.pi / 2 + np.radians(38) + 0.15, 0.3, 0.45))  # half behind the column
     assert 0 < behind.sum() < 0.9 * changed.sum()
 
 
@@ -103,3 +95,12 @@ def test_agents_go_by_what_their_names_do_not_share():
     assert film.short(names) == ["mirror", "gas"]
     assert film.short(names[:1]) == ["p2p-ddpg-robust-mirror-seed0"]
     assert film.short(["a/one", "b/one"]) == ["one", "one"]  # nothing but folders tells them apart
+
+
+@pytest.mark.extras
+def test_an_mp4_has_the_frames_of_a_gif(make, tmp_path):
+    import imageio.v3
+
+    film.film({"arm": (make(max_episode_steps=8), still)}, tmp_path / "arm.mp4", {"trial 3": 3})
+    assert imageio.v3.immeta(tmp_path / "arm.mp4")["fps"] == 12.5
+    assert len(imageio.v3.imread(tmp_path / "arm.mp4")) == 12

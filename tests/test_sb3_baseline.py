@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import evaluate
+import logx
 import pid_demo
 import sb3_baseline
 from kinova_env import TASKS
@@ -33,6 +34,14 @@ def test_a_run_leaves_curves_a_tested_policy_and_demonstrations_where_asked(flag
     assert rows[0]["length"] > 0
 
 
+def test_a_finished_run_is_not_gone_on_with(flags):
+    folder = sb3_baseline.train(replace(flags, name="a"))
+    before = (folder / "episodes.csv").read_text()
+    with pytest.raises(logx.BadInput, match="--epochs 2: a finished run cannot go on"):
+        sb3_baseline.train(replace(flags, name="a", epochs=2, resume=True))
+    assert (folder / "episodes.csv").read_text() == before
+
+
 @pytest.mark.parametrize("algo", ["sac", "td3", "ddpg"])
 def test_a_packed_policy_acts_as_the_model_does(flags, algo):
     model = sb3_baseline.make_model(sb3_baseline.resolve(replace(flags, algo=algo)))
@@ -44,18 +53,20 @@ def test_a_packed_policy_acts_as_the_model_does(flags, algo):
 def test_preloaded_demonstrations_are_what_was_done_and_only_a_true_end_stops_bootstrapping(flags):
     f = sb3_baseline.resolve(replace(flags, num_demos=3))
     demos, _ = pid_demo.demonstrations(f)
+    demos["terminated"][-1], demos["truncated"][-1] = False, True  # as if the last one had not come there in time
     model = sb3_baseline.make_model(f)
     sb3_baseline.preload(model, demos)
     buffer, n = model.replay_buffer, len(demos["rew"])
     assert buffer.pos == n and f.n_step == buffer.n_steps == 10
     np.testing.assert_array_equal(buffer.actions[:n, 0], demos["executed"])
     np.testing.assert_array_equal(buffer.next_observations[:n, 0], demos["obs2"])
+    assert buffer.dones[n - 1, 0] == buffer.timeouts[n - 1, 0] == 1
     final = buffer.dones[:n, 0] * (1 - buffer.timeouts[:n, 0])
     np.testing.assert_array_equal(final, demos["terminated"])
 
 
 def test_environments_of_another_process_are_trained_on_and_the_agent_is_tested_with_ours(tmp_path, monkeypatch):
-    """As a user would, from another folder: SAC on four spawned environments, of each task."""
+    """As a user would, from another folder: SAC on two spawned environments, of each task."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import SubprocVecEnv
