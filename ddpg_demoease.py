@@ -25,7 +25,7 @@ import evaluate
 import gas
 import logx
 import pid_demo
-from kinova_env import EPSILON, INDEX, OBS_DIM, TASKS, relabel
+from kinova_env import OBS_DIM, TASKS
 from logx import flag
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
@@ -72,9 +72,7 @@ class Flags(logx.RunFlags):
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
     keep_clone: float | None = flag(None, "weight of staying near that clone in own states; 0, robust: 10", low=0)
-    hindsight: int | None = flag(None, "copies of each episode whose goal is a place it came to; 0, robust: 2", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
-    critic_layernorm: bool | None = flag(None, "LayerNorm after each hidden layer of the critic")
 
 
 TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5; epochs of pnp: ours
@@ -83,10 +81,10 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=0.0,
-             hindsight=0, updates_per_step=1.0, critic_layernorm=False)  # fmt: skip
+             updates_per_step=1.0)  # fmt: skip
 ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=10_000,
-              keep_clone=10.0, hindsight=2, updates_per_step=0.25, critic_layernorm=True, start_steps=0)  # fmt: skip
-ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50, hindsight=0))
+              keep_clone=10.0, updates_per_step=0.25, start_steps=0)  # fmt: skip
+ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50))
 
 
 def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
@@ -105,8 +103,6 @@ def resolve(flags):
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
-    if flags.hindsight and flags.task == "pnp":
-        raise logx.BadInput(f"--hindsight {flags.hindsight}: 0 is allowed on --task pnp, where a grasp has no goal")
     if flags.keep_clone and not flags.clone_iters:
         raise logx.BadInput(f"--keep_clone {flags.keep_clone:g}: there is no clone at --clone_iters 0; 0 is allowed")
     return flags
@@ -170,19 +166,6 @@ def store_last_step(B, episode, n, gamma, timeout_ends=False):
         B.store(*n_step_sum(episode[-m:], gamma, timeout_ends))
 
 
-def hindsight_episode(task, episode, rng):
-    """The episode up to a random step, as if where the TCP then was had been the goal (HER, Andrychowicz et al. 2017).
-    Empty where the episode began there."""
-    s, a, r, s2 = (np.array(column) for column in list(zip(*episode, strict=True))[:4])
-    P_g, e = INDEX[task]["P_g"], INDEX[task]["e"]
-    t = rng.integers(len(s))
-    s, r, s2, success = relabel(task, s, r, s2, goal=s2[t, P_g] - s2[t, e])
-    if np.linalg.norm(s[0, e]) < EPSILON:
-        return []
-    end = int(np.argmax(success)) + 1
-    return list(zip(s[:end], a[:end], r[:end], s2[:end], success[:end], [False] * end, strict=True))
-
-
 def store_demonstrations(demos, B_o, B_d, f):
     """B_d gets what the demonstrator asked for, B_o what was done, which is another thing where noise was added."""
     episode, columns = [], [demos[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated")]
@@ -198,20 +181,20 @@ def store_demonstrations(demos, B_o, B_d, f):
 # ---- networks --------------------------------------------------------------------------------------------------------
 
 
-def mlp(sizes, layernorm=False):
+def mlp(sizes):
     layers = []
     for n_in, n_out in zip(sizes[:-2], sizes[1:-1], strict=True):
-        layers += [nn.Linear(n_in, n_out), *([nn.LayerNorm(n_out)] if layernorm else []), nn.ReLU()]
+        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
 
 
 class ActorCritic(nn.Module):
     """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R."""
 
-    def __init__(self, obs_dim, hidden_sizes, critic_layernorm):
+    def __init__(self, obs_dim, hidden_sizes):
         super().__init__()
         self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
-        self.q_net = mlp([obs_dim + 4, *hidden_sizes, 1], critic_layernorm)
+        self.q_net = mlp([obs_dim + 4, *hidden_sizes, 1])
 
     def pi(self, s):
         """pi_mu(s) of s (n, obs_dim): (n, 4). mu_net gives the action before its tanh."""
@@ -262,7 +245,7 @@ class Learner:
 
     def __init__(self, flags):
         f = self.flags = flags
-        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.critic_layernorm).to(f.device)
+        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes).to(f.device)
         self.target = deepcopy(self.net).requires_grad_(False)
         self.clone_net = deepcopy(self.net.mu_net).requires_grad_(False)  # stays as it is after clone()
         self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_net.parameters())
@@ -361,7 +344,7 @@ def train(flags):
 def loop(f, run):
     demos, demo_env_steps = (None, 0) if run.checkpoint else pid_demo.demonstrations(f)
     torch.manual_seed(f.seed)
-    rng = np.random.default_rng(f.seed)  # of exploration and hindsight
+    rng = np.random.default_rng(f.seed)  # of exploration
     env = gymnasium.make(TASKS[f.task].env_id, stage="train", max_episode_steps=f.max_ep_len, disable_env_checker=True)
     env = logx.Replayable(env, f.seed)
     learner, B_d = Learner(f), None
@@ -400,10 +383,6 @@ def loop(f, run):
 
         # reset
         if terminated or truncated:
-            for _ in range(f.hindsight):
-                copy = hindsight_episode(f.task, env.episode, rng)
-                for i in range(len(copy)):
-                    store_last_step(B_o, copy[: i + 1], f.n_step, f.gamma)
             run.log_episode(t, info)
             s, _ = env.reset()
 

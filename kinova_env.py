@@ -145,27 +145,6 @@ def grasped(obs):
     return ((P_o - P_g + e) ** 2).sum(-1) < 1e-6  # 1 mm
 
 
-def relabel(task, s, r, s2, goal):
-    """The same steps of P2P or P2P-O towards another goal (hindsight, Andrychowicz et al. 2017).
-
-    s, s2: (n, OBS_DIM) raw observations before and after; r: (n,) rewards; goal: (3,) or (n, 3) in m. Returns
-    (s, r, s2, success (n,) bool): P_g and e are the new goal's, and so are the distance and reaching terms of Eq. 11;
-    effort and collision stay. Raises ValueError on P&P, where the way to the cube does not depend on the goal.
-    """
-    if TASKS[task].cube == "object":
-        raise ValueError(f"task {task!r}: only steps of p2p and p2po can be given another goal")
-    P_g, e = INDEX[task]["P_g"], INDEX[task]["e"]
-    s, s2 = s.copy(), s2.copy()
-    before = np.linalg.norm(s2[:, e], axis=1)
-    for obs in (s, s2):
-        obs[:, e] += goal - obs[:, P_g]
-        obs[:, P_g] = goal
-    distance = np.linalg.norm(s2[:, e], axis=1)
-    success = distance < EPSILON
-    reached = r > R_1 / 2  # the step was a success
-    return s, r - ALPHA_1 * (distance - before) + R_1 * (success.astype(float) - reached), s2, success
-
-
 def start_posture(theta, rho, z):
     """Joint angles (4,) of a start pose: TCP at cylinder coordinates (rad, m, m), tool horizontal and radially outward.
 

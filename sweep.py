@@ -9,7 +9,7 @@
 
 Columns are called as the paper's tables vary them: `lambda=1.8`, `demos=160`,
 `baseline`. `--vary` adds lists of values for any flag of the scripts, written
-as in the names of folders (`hidden_sizes=64x64,128x128`, `hindsight=0,2`).
+as in the names of folders (`hidden_sizes=64x64,128x128`, `mask=q,none`).
 
 A run is one command of ddpg_demoease.py or ppo_demoease.py, and the folder that
 this command makes by itself; what it prints goes to log.txt there. The same

@@ -5,7 +5,6 @@ import math
 from functools import partial
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -16,7 +15,6 @@ import ddpg_demoease as ddpg
 import evaluate
 import gas
 import logx
-from kinova_env import INDEX, TASKS
 
 
 @pytest.fixture
@@ -316,63 +314,6 @@ def test_the_ring_of_a_run_keeps_the_newest_steps(world):
     assert sorted(stored(run).tolist()) == sorted(transitions(run.steps[-50:]).tolist())
 
 
-def cylinder(p):
-    return math.atan2(p[1], p[0]), math.hypot(p[0], p[1]), p[2]
-
-
-@pytest.mark.parametrize("task", ["p2p", "p2po"])
-def test_a_hindsight_episode_is_what_the_simulator_gives_towards_that_goal(task):
-    env = gymnasium.make(TASKS[task].env_id, stage="train", max_episode_steps=60, disable_env_checker=True)
-    rng, compared = np.random.default_rng(0), 0
-    P_g, e = INDEX[task]["P_g"], INDEX[task]["e"]
-    for seed in range(4):
-        (s, _), episode, ended = env.reset(seed=seed), [], False
-        cube = {"object": cylinder(env.unwrapped.cube)} if task == "p2po" else {}
-        start, drift = cylinder(s[P_g] - s[e]), rng.uniform(-1, 1, 4).astype(np.float32)
-        while not ended:
-            a = np.clip(drift + rng.normal(0, 0.3, 4), -1, 1).astype(np.float32)
-            s2, r, terminated, truncated, _ = env.step(a)
-            episode.append((s, a, r, s2, terminated, truncated))
-            s, ended = s2, terminated or truncated
-        copy = ddpg.hindsight_episode(task, episode, rng)
-        if not copy:
-            continue
-        goal = copy[0][0][P_g]
-        s, _ = env.reset(options={"start": start, "goal": cylinder(goal.astype(float)), **cube})
-        np.testing.assert_allclose(s, episode[0][0] + np.r_[np.zeros(16), goal - episode[0][0][P_g],
-                                   goal - episode[0][0][P_g], np.zeros(len(s) - 22)], atol=1e-5)  # fmt: skip
-        for s_copy, a, r_copy, s2_copy, terminated_copy, truncated_copy in copy:
-            s2, r, terminated, truncated, info = env.step(a)
-            np.testing.assert_allclose(s_copy, s, atol=2e-4)
-            np.testing.assert_allclose(s2_copy, s2, atol=2e-4)
-            assert r_copy == pytest.approx(r, abs=1e-4) and terminated_copy == terminated and not truncated_copy
-            s, compared = s2, compared + 1
-        assert info["is_success"] and a is copy[-1][1]  # it ends where it reaches that goal
-    env.close()
-    assert compared > 60
-
-
-def test_a_hindsight_episode_is_empty_where_it_would_begin_at_its_goal():
-    s, s2 = np.zeros(22, np.float32), np.zeros(22, np.float32)
-    s[19], s2[19] = 0.5, 0.48  # the TCP moves by 2 cm, less than epsilon
-    assert ddpg.hindsight_episode("p2p", [(s, np.zeros(4), 0.0, s2, False, True)], np.random.default_rng(0)) == []
-
-
-def test_hindsight_stores_so_many_copies_after_each_episode(world, monkeypatch):
-    copies, make = [], ddpg.hindsight_episode
-    monkeypatch.setattr(ddpg, "hindsight_episode", lambda *args: copies.append(make(*args)) or copies[-1])
-    run = world("a", hindsight=2, n_step=3, symmetry="none")
-    ends = [0, *(t + 1 for t, x in enumerate(run.steps) if x.end)]
-    assert len(copies) == 2 * (len(ends) - 1) and max(map(len, copies)) > 3
-    expected = []
-    for n, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
-        parts = run.steps[begin:end], *(as_steps(copy) for copy in copies[2 * n : 2 * n + 2])
-        expected += [transitions(part, 3) for part in parts if part]
-    if run.steps[ends[-1] :]:
-        expected.append(transitions(run.steps[ends[-1] :], 3).reshape(-1, 50))
-    torch.testing.assert_close(stored(run), torch.cat(expected))
-
-
 # ---- when ------------------------------------------------------------------------------------------------------------
 
 
@@ -419,14 +360,6 @@ def test_updates_per_step_is_kept_up_with(world, blocks):
     assert sum(n for _, n in blocks) == 15
 
 
-def test_critic_layernorm_sits_after_each_hidden_linear_layer_of_the_critic_only():
-    for layernorm in (True, False):
-        net = ddpg.Learner(resolve(hidden_sizes=(8, 12), critic_layernorm=layernorm)).net
-        hidden = ["Linear", "LayerNorm", "ReLU"] if layernorm else ["Linear", "ReLU"]
-        assert [type(layer).__name__ for layer in net.q_net] == 2 * hidden + ["Linear"]
-        assert [type(layer).__name__ for layer in net.mu_net] == 2 * ["Linear", "ReLU"] + ["Linear"]
-
-
 # ---- defaults --------------------------------------------------------------------------------------------------------
 
 DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 5; 5 T, 2 T and T are ours
@@ -438,7 +371,7 @@ DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 
 }  # fmt: skip
 AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1,
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
-                    clone_iters=0, keep_clone=0.0, hindsight=0, critic_layernorm=False,
+                    clone_iters=0, keep_clone=0.0,
                     updates_per_step=1)  # fmt: skip
 
 
@@ -457,10 +390,9 @@ def test_a_very_short_episode_still_updates():
 
 
 @pytest.mark.parametrize("flags, says", [
-    (dict(task="pnp", hindsight=1), "--hindsight 1: 0 is allowed on --task pnp"),
     (dict(keep_clone=1.0), "--keep_clone 1: there is no clone at --clone_iters 0"),
     (dict(num_demos=4, replay_size=10), "--replay_size 10: must hold the 18 demonstrated steps"),
-], ids=["hindsight with a cube to grasp", "no clone", "B_o too small"])  # fmt: skip
+], ids=["no clone", "B_o too small"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ddpg, tmp_path, "a", recorded=demo_arrays(), **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()

@@ -534,35 +534,6 @@ def test_cube_is_four_centimetres_wide_and_fits_between_the_open_fingers(make):
         assert (info["collision"] == "cube") == hit
 
 
-# ---- hindsight -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task, end", [("p2p", "success"), ("p2p", "self"), ("p2po", "cube"), ("p2po", "timeout")])
-def test_relabelled_steps_are_the_simulated_ones_with_that_goal(make, task, end):
-    options = far(task, start=(0.0, 0.52, 0.42), goal=(0.7 if end == "success" else 2.5, 0.52, 0.42))
-    options |= {"object": (0.9, 0.5, 0.42)} if end == "cube" else {}
-    actions = [FOLD] * 200 if end == "self" else [-TURN] * 60
-    rows = rollout(make(task), actions, seed=0, options=options)
-    assert rows[-1][2] == (end != "timeout")
-    s, r, s2 = (np.array(column) for column in (
-        [row[0] for row in rows[:-1]], [row[1] for row in rows[1:]], [row[0] for row in rows[1:]]))  # fmt: skip
-    reached = cylinder(part(s2, "P_g")[20] - part(s2, "e")[20])  # where the TCP came by; and a place it never came to
-    for goal in (reached, (-2.0, 0.5, 0.5)):
-        replay = rollout(make(task), actions, seed=0, options=options | {"goal": goal})[: len(rows)]
-        n = len(replay) - 1
-        new_s, new_r, new_s2, success = kinova_env.relabel(task, s[:n], r[:n], s2[:n], cartesian(*goal))
-        np.testing.assert_allclose(new_s, [row[0] for row in replay[:-1]], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(new_s2, [row[0] for row in replay[1:]], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(new_r, [row[1] for row in replay[1:]], rtol=0, atol=1e-8)
-        assert success.tolist() == [row[4]["is_success"] for row in replay[1:]]
-        assert success.any() == (goal is reached)
-    same = kinova_env.relabel(task, s, r, s2, part(s2, "P_g"))  # one goal a row
-    assert same[3].tolist() == [row[4]["is_success"] for row in rows[1:]]
-    np.testing.assert_allclose(same[1], r, rtol=0, atol=1e-12)
-    with pytest.raises(ValueError, match="pnp"):
-        kinova_env.relabel("pnp", s, r, s2, cartesian(*reached))
-
-
 # ---- one process, many environments, many episodes -------------------------------------------------------------------
 
 
