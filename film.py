@@ -118,14 +118,14 @@ def picture(client, width, height, goal, radius):
     look = dict(lightDirection=LIGHT.tolist(), lightDistance=5, lightAmbientCoeff=0.6, lightDiffuseCoeff=0.42,
                 lightSpecularCoeff=0.05, shadow=1, renderer=pybullet.ER_TINY_RENDERER)  # fmt: skip
     *_, rgba, depth, _ = pybullet.getCameraImage(w, h, view, lens, **look, physicsClientId=client)
-    rgb = np.asarray(rgba, dtype=np.float32).reshape(h, w, 4)[..., :3]
+    image = np.asarray(rgba, dtype=np.float32).reshape(h, w, 4)[..., :3]
     if goal is not None:
         depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.reshape(depth, (h, w)))  # of the buffer, to m
-        _ball(rgb, depth, np.reshape(view, (4, 4)).T, np.reshape(lens, (4, 4)), goal, radius)
-    return rgb.reshape(height, SMOOTH, width, SMOOTH, 3).mean((1, 3)).astype(np.uint8)
+        _ball(image, depth, np.reshape(view, (4, 4)).T, np.reshape(lens, (4, 4)), goal, radius)
+    return image.reshape(height, SMOOTH, width, SMOOTH, 3).mean((1, 3)).astype(np.uint8)
 
 
-def _ball(rgb, depth, view, lens, centre, radius, alpha=0.6):
+def _ball(image, depth, view, lens, centre, radius, alpha=0.6):
     """Blends a ball into a picture (h, w, 3) where nothing lies before it; depth: (h, w) in m along the view."""
     h, w = depth.shape
     c = view[:3, :3] @ centre + view[:3, 3]  # in the camera's frame, which looks along -z
@@ -137,10 +137,15 @@ def _ball(rgb, depth, view, lens, centre, radius, alpha=0.6):
     seen = (root > 0) & (near < depth)
     normal = (ray[seen] * near[seen, None] - c) / radius
     shade = 0.75 + 0.25 * normal @ (view[:3, :3] @ LIGHT / np.linalg.norm(LIGHT))
-    rgb[seen] = (1 - alpha) * rgb[seen] + alpha * 255 * shade[:, None] * np.array(GREEN)
+    image[seen] = (1 - alpha) * image[seen] + alpha * 255 * shade[:, None] * np.array(GREEN)
 
 
 # ---- films -----------------------------------------------------------------------------------------------------------
+
+
+def rgb(colour):
+    """0 ... 1 to 0 ... 255."""
+    return tuple(int(255 * c) for c in colour)
 
 
 def short(names):
@@ -192,8 +197,8 @@ def frames(agents, episodes, every=EVERY):
                     text = f"{title}   {t * dt:.1f} s" + f"\n{names[n]}" * (len(agents) > 1)
                     draw.text((10, 8), text, font=font, fill=(40, 40, 40))
                 if border:
-                    colour = tuple(int(255 * c) for c in border)
-                    draw.rectangle([0, 0, shown[name].width - 1, shown[name].height - 1], outline=colour, width=5)
+                    frame = [0, 0, shown[name].width - 1, shown[name].height - 1]
+                    draw.rectangle(frame, outline=rgb(border), width=5)
                     del obs[name]
             if t % every == 0 or not obs:
                 yield (whole := np.concatenate([np.asarray(shown[name]) for name in agents], axis=1))
@@ -215,8 +220,13 @@ def film(agents, path, episodes, every=EVERY):
                 video.append_data(one)
 
     def gif(file):
+        pictures = [Image.fromarray(one) for one in frames(agents, episodes, every)]
+        sample = pictures[0].copy()  # one palette, that of the first picture and of the borders, makes a small file
+        for n, colour in enumerate((GREEN, RED)):
+            sample.paste(rgb(colour), (20 * n, 0, 20 * n + 20, 20))
         # method 2, fast octree: the median cut that is Pillow's own choice gives the orange cube a grey
-        first, *rest = [Image.fromarray(one).quantize(64, method=2) for one in frames(agents, episodes, every)]
+        palette = sample.quantize(64, method=2)
+        first, *rest = [picture.quantize(palette=palette, dither=0) for picture in pictures]
         first.save(file, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
 
     logx.atomic_write(path, mp4 if str(path).endswith(".mp4") else gif)
