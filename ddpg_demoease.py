@@ -52,7 +52,7 @@ class Flags(logx.RunFlags):
     steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T, robust p2p: 1000", low=1)
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 1; start_steps and update_after: ours)
-    update_every: int | None = flag(None, "N_up, steps between blocks of as many updates; T/20", low=1)
+    update_every: int | None = flag(None, "N_up, steps between blocks of N_up * updates_per_step updates; T/20", low=1)
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T, robust: 0", low=0)
     update_after: int | None = flag(None, "no updates before; T", low=0)
     replay_size: int = flag(1_000_000, "N_o", low=1, high=10_000_000)
@@ -71,7 +71,7 @@ class Flags(logx.RunFlags):
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
-    keep_clone: float | None = flag(None, "weight of staying near that clone in own states; 0, robust: 10", low=0)
+    keep_clone: float | None = flag(None, "weight of staying near that clone in states of B_o; 0, robust: 10", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
 
 
@@ -167,7 +167,8 @@ def store_last_step(B, episode, n, gamma, timeout_ends=False):
 
 
 def store_demonstrations(demos, B_o, B_d, f):
-    """B_d gets what the demonstrator asked for, B_o what was done, which is another thing where noise was added."""
+    """B_d gets what the demonstrator asked for, B_o what was done, which is another thing where noise was added: then
+    Eq. 8 asks the critic about actions that it has not seen. Of B_d, s and a alone are used."""
     episode, columns = [], [demos[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated")]
     for (s, a, *rest), executed in zip(zip(*columns, strict=True), demos.get("executed", demos["act"]), strict=True):
         B_d.store(*n_step_sum([(s, a, *rest)], f.gamma, f.timeout_ends))
@@ -234,9 +235,15 @@ def loss_A(L_O, L_BC, lambda_bc):
     return L_O + lambda_bc * L_BC
 
 
+def loss_keep(a_clone, a_own):
+    """Ours: how far the actions in states of B_o are from the first clone's, averaged over the batch and the 4 actions.
+    --keep_clone times this is added to Eq. 6."""
+    return ((a_clone - a_own) ** 2).mean()
+
+
 # ---- update ----------------------------------------------------------------------------------------------------------
 
-MEASURED = ["L_O", "L_BC", "L_C", "L_A", "mask_fraction", "Q_mean", "Q_max", "pretanh_own", "pretanh_demo",
+MEASURED = ["L_O", "L_BC", "L_keep", "L_C", "L_A", "mask_fraction", "Q_mean", "Q_max", "pretanh_own", "pretanh_demo",
             "bc_relative_error"]  # fmt: skip
 
 
@@ -260,7 +267,7 @@ class Learner:
         return self.net.pi(torch.from_numpy(s).to(self.flags.device)).cpu().numpy()
 
     def updates(self, B_o, B_d, n):
-        """n gradient steps. Returns {name: float} of the last one; NaN where there are no demonstrations."""
+        """n gradient steps. Returns {name: float} of the last one; what needs demonstrations is NaN without them."""
         for _ in range(n):
             measured = self.update(B_o, B_d)
         return dict(zip(MEASURED, torch.stack(measured).tolist(), strict=True))
@@ -283,9 +290,10 @@ class Learner:
             M = mask(Q_demo, Q_own) if f.mask == "q" else torch.ones_like(Q_demo)
         L_BC = loss_BC(a_demo, a_hat, M)  # without demonstrations NaN, as their other figures: not measured
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
+        L_keep = torch.full_like(L_O, math.nan)
         if f.keep_clone and B_d:
-            a_clone = torch.tanh(self.clone_net(s))
-            L_A = L_A + f.keep_clone * loss_BC(a_clone, a_own, torch.ones_like(Q))
+            L_keep = loss_keep(torch.tanh(self.clone_net(s)), a_own)
+            L_A = L_A + f.keep_clone * L_keep
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
         L_C.backward()
@@ -294,13 +302,14 @@ class Learner:
         # mu' <- omega mu' + (1 - omega) mu, and nu' alike
         self.move_targets(list(self.target.parameters()), list(net.parameters()), None)
         return [x.detach() for x in (
-            L_O, L_BC, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
+            L_O, L_BC, L_keep, L_C, L_A, M.mean(), Q.mean(), Q.max(), u.abs().mean(), u_demo.abs().mean(),
             # of the demonstrated actions' mean square: 0 is a perfect clone, 1 no better than a = 0
             ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
         )]  # fmt: skip
 
     def clone(self, B_d):
-        """Before the first step: clone_iters updates of the actor on B_d, L_BC with M = 1."""
+        """Before the first step: clone_iters updates of the actor on B_d, L_BC with M = 1, at the critic's rate, which
+        falls to 0 (a cosine). Its target begins as this clone too."""
         f, net = self.flags, self.net
         optimizer = torch.optim.Adam(self.mu, lr=f.q_lr, fused=True)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
@@ -366,8 +375,9 @@ def loop(f, run):
             if f.demos_in_B_o and len(B_d.rows) > f.replay_size:
                 raise logx.BadInput(f"--replay_size {f.replay_size}: must hold the {len(B_d.rows)} demonstrated steps")
             store_demonstrations(demos, B_o, B_d, f)
-            learner.clone(B_d)
     run.begin(demo_env_steps)
+    if demos:
+        learner.clone(B_d)
 
     while t < run.total_steps:
         # act

@@ -377,15 +377,13 @@ def print_agents():
     """Every policy.pt in RESULTS and RUNS."""
     places = dict.fromkeys(place.resolve() for place in (RESULTS, *RUNS))
     for path in (path for place in places for path in sorted(place.glob("**/policy.pt"))):
-        config, tested = {}, "not tested"
-        with contextlib.suppress(OSError, ValueError):
-            config = json.loads((path.parent / "config.json").read_text())
+        tested = "not tested"
         for name, read in (("evaluation.csv", open), ("evaluation.csv.gz", gzip.open)):
             with contextlib.suppress(OSError), read(path.parent / name, "rt") as file:
                 success = [row["success"] == "1" for row in csv.DictReader(file)]
                 tested = f"{100 * np.mean(success):.1f} % of {len(success)} test trials"
-        print(*(config.get(key, "?") for key in ("task", "algo", "recipe")), f"- {tested}")
-        print(f"    python {sys.argv[0]} {os.path.relpath(path.parent)} --watch")
+        print(path.parent.name, f"- {tested}")
+        print(f"    {os.path.relpath(sys.executable)} {sys.argv[0]} {os.path.relpath(path.parent)} --watch")
     print("--watch needs a display; --gif agent.gif needs none")
 
 

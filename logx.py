@@ -187,9 +187,8 @@ def check_flags(flags):
     return flags
 
 
-# TensorBoard's group of a column, by its first word; of what updates measure, else: "update".
 BOARD = dict(eval="test", EpRet="train", EpLen="train", Success="train", L="loss", epoch="time", env="time",
-             demo="time", seconds="time")  # fmt: skip
+             demo="time", seconds="time")  # TensorBoard's group of a column, by its first word  # fmt: skip
 # What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
 NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume",
                  "device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard",
@@ -198,7 +197,7 @@ NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed",
 
 def recorded(flags):
     """With --resume FOLDER, the flags that the run there was begun with, and what else was asked for now; else the
-    flags as they are. Raises BadInput where the folder holds no run of this script, or no checkpoint to go on from."""
+    flags as they are. Raises BadInput where the folder holds no run of this script."""
     if not isinstance(flags.resume, str):
         return flags
     folder = Path(flags.resume)
@@ -209,9 +208,8 @@ def recorded(flags):
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
         if missing := set(fields) - set(before):
             raise ValueError(f"its config.json lacks {', '.join(sorted(missing))}")
-        os.stat(folder / "checkpoint.pt")
     except (OSError, ValueError, AttributeError) as error:
-        raise BadInput(f"--resume {folder}: must be a run's folder with a checkpoint ({one_line(error)})") from None
+        raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
     asked = {name: v for name, v in dataclasses.asdict(flags).items() if v != fields[name]}
     where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}
     return dataclasses.replace(flags, **(before | asked | where))
@@ -219,18 +217,18 @@ def recorded(flags):
 
 def fill_in(flags, defaults, algo):
     """A copy of the flags with `defaults`, {flag: value} of task and recipe, in place of None, with a name where there
-    is none, and with `variant`, what differs from the recipe.
-
-    Raises BadInput where the name is no folder's or the device is not here."""
+    is none, and with `variant`, what differs from the recipe. Raises BadInput where flags do not fit or a name is no
+    folder's."""
+    for key in ("gains", "demo_noise") if flags.demos is not None else ():
+        if getattr(flags, key) is not None:
+            raise BadInput(f"--{key} {getattr(flags, key)}: is of own recordings, and does not go with --demos")
     recipe = dataclasses.replace(type(flags)(task=flags.task, recipe=flags.recipe), **defaults)
-    given = {key: getattr(flags, key) for key in defaults}
-    flags = dataclasses.replace(flags, **{key: defaults[key] for key, value in given.items() if value is None})
+    flags = dataclasses.replace(flags, **{key: v for key, v in defaults.items() if getattr(flags, key) is None})
+    for each in (flags, recipe) if flags.demos is not None else ():  # the file says what they were recorded with
+        each.gains = each.demo_noise = None
     changed = {key: value for key, value in dataclasses.asdict(flags).items()
                if key not in NOT_A_VARIANT and value != getattr(recipe, key)}  # fmt: skip
-    if flags.demos is not None:  # what they were recorded with is said by the file, not by these flags
-        flags.gains = flags.demo_noise = None
-        changed = {key: value for key, value in changed.items() if key not in ("gains", "demo_noise")}
-        changed["demos"] = Path(flags.demos).name
+    changed |= {"demos": Path(flags.demos).name} if flags.demos is not None else {}
     texts = {k: "x".join(map(str, v)) if isinstance(v, (tuple, list)) else str(v) for k, v in changed.items()}
     variant = "-".join(f"{k}={v}" for k, v in texts.items()).replace(" ", "").replace("/", "_")
     flags.variant = variant if len(variant) <= 80 else f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"

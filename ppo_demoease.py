@@ -411,9 +411,9 @@ def loop(f, run):
         torch.set_rng_state(state["torch_rng"])
     else:
         t, (s, _), shown = 0, env.reset(), open_epoch(0)
-        if B_d.filled:
-            learner.clone(B_d, R_demo)
     run.begin(demo_env_steps)
+    if not state and B_d.filled:
+        learner.clone(B_d, R_demo)
 
     while t < run.total_steps:
         # act

@@ -218,7 +218,7 @@ def rates(jobs):
     measured = {}
     for kind, job in tqdm({job.kind: job for job in jobs}.items(), "measuring", leave=False, disable=None):
         algo, *_, demos = kind
-        short = ["--epochs", "2", "--eval_every", "0", "--clone_iters", "0", "--num_demos", "4" if demos else "0"]
+        short = ["--epochs", "2", "--eval_every", "0", "--clone_iters", "1", "--num_demos", "4" if demos else "0"]
         short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []
         with tempfile.TemporaryDirectory() as folder:
             words = (*job.words, *short, "--data_dir", folder, "--name", "rate")

@@ -97,8 +97,10 @@ class Paper:
         if demo is not None:
             s_d, a_d = demo
             L_BC, M, a_hat = cloned(s_d, a_d, self.masked)
-            L_keep, *_ = cloned(s, torch.tanh(self.u_clone(s)).detach(), False)
-            L_A = self.lambda_bc * L_BC + L_O + self.keep_clone * L_keep
+            L_A = self.lambda_bc * L_BC + L_O
+            if self.keep_clone:
+                figures["L_keep"], *_ = cloned(s, torch.tanh(self.u_clone(s)).detach(), False)
+                L_A = L_A + self.keep_clone * figures["L_keep"]
             figures |= {"L_BC": L_BC, "mask_fraction": M.float().mean(), "pretanh_demo": self.u(s_d).abs().mean(),
                         "bc_relative_error": torch.mean((a_d - a_hat) ** 2) / torch.mean(a_d**2)}  # fmt: skip
         for L, parameters in ((L_A, self.mu), (L_C, self.nu)):

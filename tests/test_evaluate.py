@@ -485,10 +485,10 @@ def test_the_list_names_each_trained_agent_with_its_success_and_the_command_that
     assert main("--list") == 0
     out = capsys.readouterr().out.splitlines()
     shipped = Path(evaluate.__file__).parent.glob("data/results/*/policy.pt")
+    python = os.path.relpath(sys.executable)
     for folder in (own, *(Path(os.path.relpath(path.parent)) for path in shipped)):
-        assert f"    python evaluate.py {folder} --watch" in out
-    before = out[out.index(f"    python evaluate.py {own} --watch") - 1]
-    assert before == "p2p ddpg robust - 50.0 % of 2 test trials"
+        assert f"    {python} evaluate.py {folder} --watch" in out
+    assert out[out.index(f"    {python} evaluate.py {own} --watch") - 1] == "own - 50.0 % of 2 test trials"
 
 
 BAD = {

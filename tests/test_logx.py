@@ -163,7 +163,10 @@ def test_what_is_not_given_is_decided_by_task_and_recipe_and_what_differs_is_in_
 
 
 def test_demonstrations_of_a_file_are_named_by_it_and_not_by_how_they_would_be_recorded():
-    flags = filled(demos="some/file.npz", gains="authors", demo_noise=0.2)
+    for given in ({"gains": "fast"}, {"demo_noise": 0.2}):
+        with pytest.raises(BadInput, match=f"--{next(iter(given))} .*does not go with --demos"):
+            filled(demos="some/file.npz", **given)
+    flags = filled(demos="some/file.npz")
     assert (flags.variant, flags.gains, flags.demo_noise) == ("demos=file.npz", None, None)
 
 
@@ -583,13 +586,18 @@ def test_resume_of_a_folder_takes_the_flags_of_the_run_there_and_what_is_asked_n
 
 
 @pytest.mark.parametrize("name, data, says", [
-    ("checkpoint.pt", None, "No such file"), ("config.json", None, "No such file"), ("config.json", b"{", "Expecting"),
+    ("config.json", None, "No such file"), ("config.json", b"{", "Expecting"),
     ("config.json", b"[]", "no attribute"), ("config.json", b"{}", "config.json lacks act_noise"),
 ])  # fmt: skip
 def test_resume_of_a_folder_without_a_run_to_go_on_with_is_refused(stopped, name, data, says):
     spoil(name, data)(stopped)
-    with pytest.raises(BadInput, match=f"--resume {stopped}: must be a run's folder with a checkpoint .*{says}"):
+    with pytest.raises(BadInput, match=f"--resume {stopped}: must be a run's folder .*{says}"):
         logx.recorded(Flags(resume=str(stopped)))
+
+
+def test_a_run_killed_before_its_first_checkpoint_is_begun_anew_from_its_folder(stopped):
+    spoil("checkpoint.pt", None)(stopped)
+    assert logx.recorded(Flags(resume=str(stopped))).name == stopped.name
 
 
 @pytest.mark.root
