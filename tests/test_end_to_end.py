@@ -31,7 +31,7 @@ import logx
 
 torch.optim.Adam([torch.zeros(1)])  # imports as much again, here once for all processes that are forked
 ROOT = Path(kinova_env.__file__).parent
-DEMONSTRATED = dict(num_demos=2, lambda_bc=None, gains="fast", recipe="robust", clone_iters=20, epochs=6)
+DEMONSTRATED = dict(num_demos=2, lambda_bc=None, recipe="robust", clone_iters=20, epochs=6)
 AGENTS = {  # the last episodes of P2P-O collide, those of P&P grasp
     "ddpg": TINY[SCRIPTS["ddpg"]] | DEMONSTRATED | dict(task="p2po", act_noise=2.0, update_every=10),
     "ppo": TINY[SCRIPTS["ppo"]] | DEMONSTRATED | dict(task="pnp", log_std=0.0),
