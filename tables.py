@@ -80,7 +80,7 @@ def split(values, length):
     """values (sum(length + 1), ...), of t = 0 ... length of one episode after another, as a list of one each."""
     if len(values) != np.sum(length + 1):
         raise ValueError("its arrays do not fit together")
-    return np.split(values, np.cumsum(length + 1)[:-1])
+    return np.split(values, np.cumsum(length + 1)[:-1])[: len(length)]  # of no episode, np.split makes one
 
 
 def read_errors(path):

@@ -482,6 +482,12 @@ def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_
     assert row["git_commit"] == COMMIT
 
 
+def test_a_run_without_a_successful_trial_is_published_and_drawn(tmp_path):
+    publish.publish([publishable(tmp_path / "x/a", success=(0, 0))])
+    assert tables.read_errors(tmp_path / "results/a/trajectories.npz") == []
+    assert figure("error") is None and figure("trajectories") is None
+
+
 def test_what_is_published_makes_the_same_tables_and_figures(tmp_path):
     run = publishable(tmp_path / "x/a", success=(1, 0, 1))
     publish.publish([run])
