@@ -118,8 +118,33 @@ def draw_curve(ax, runs, label, **look):
     ax.plot(np.arange(every, longest + 1), np.nanmean(curves[:, every - 1 :], axis=0), linewidth=0.6, alpha=0.7, **look)
 
 
+def named(runs, flags):
+    """{label: runs} of each group and column, where --runs names runs of several groups: all of them are drawn."""
+    runs = runs[runs.algo != "pid"]
+    if not flags.runs or flags.recipe or len(runs[GROUP].drop_duplicates()) < 2:
+        return {}
+    groups = runs.groupby([*GROUP, *COLUMN[1:]])
+    return {f"{group_label(group)}, $N_{{demos}}={N}$, " + rf"$\lambda_{{BC}}={lam:g}$": members
+            for (*group, N, lam), members in groups}  # fmt: skip
+
+
+def named_learning_figure(task, lines):
+    """Return over training episodes, a line for each of `named`."""
+    figure = Figure(figsize=(5.4, 3.4), layout="constrained")
+    ax = figure.add_subplot()
+    for i, (label, members) in enumerate(lines.items()):
+        draw_curve(ax, members, label, **style(i))
+    ax.set(xlabel="episode", ylabel=f"return (mean of last {tables.WINDOW} episodes)", xlim=(0, None))
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17))
+    figure.suptitle(TITLES[task], fontsize=9)
+    caption(figure, "Mean over seeds and its 95 % band (Student); thin: the seeds that go on after the shortest.")
+    return figure
+
+
 def learning_figure(task, runs, flags):
     """Return over training episodes, a panel for each sweep of the paper (Fig. 6, 7, 8)."""
+    if lines := named(runs, flags):
+        return named_learning_figure(task, lines)
     group, panels, empty = main_group(task, runs, flags.recipe), {"lambda": [], "demos": []}, []
     if not len(group):
         return None
@@ -234,11 +259,14 @@ def error_figure(task, runs, flags):
     """||e_t|| over all successful test trials, a panel a column (Fig. 10, 11, 12). A trial that has ended keeps its
     last error: each counts alike at every t."""
     group, panels = main_group(task, runs, flags.recipe), {}
-    for column in tables.columns(task, group).drop_duplicates(COLUMN).itertuples():
-        paths = [c.trajectories for c in of_column(group, column).curves if c.trajectories.exists()]
+    of_all = named(runs, flags)
+    parts = of_all or {column_label(column, "both"): of_column(group, column)
+                       for column in tables.columns(task, group).drop_duplicates(COLUMN).itertuples()}  # fmt: skip
+    for label, part in parts.items():
+        paths = [c.trajectories for c in part.curves if c.trajectories.exists()]
         if errors := [error for path in paths for error in tables.read_errors(path)]:
             seeds = f"{len(paths)} seed{'s' * (len(paths) > 1)}"
-            panels[f"{column_label(column, 'both')}\n{len(errors):,} trials, {seeds}"] = errors
+            panels[f"{textwrap.fill(label, 34) if of_all else label}\n{len(errors):,} trials, {seeds}"] = errors
     if not panels:
         return None
     rows, across = math.ceil(len(panels) / 3), min(3, len(panels))
@@ -256,7 +284,9 @@ def error_figure(task, runs, flags):
     for ax in figure.axes:
         ax.label_outer()
         ax.set_visible(ax.has_data())
-    hidden = title(figure, task, group, runs)
+    hidden = "" if of_all else title(figure, task, group, runs)
+    if of_all:
+        figure.suptitle(TITLES[task], fontsize=9)
     caption(figure, r"Mean $\pm$ standard deviation over all successful test trials; dotted: $\epsilon$. A trial that "
             "has ended keeps its last error.", hidden)  # fmt: skip
     return figure

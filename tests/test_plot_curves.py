@@ -346,6 +346,16 @@ def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstr
     assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 4
 
 
+def test_runs_named_with_runs_are_all_drawn_whatever_their_flags(tmp_path):
+    for i, variant in enumerate(("", "n_step=1")):
+        write_run(tmp_path / f"x/{i}", success=(1, 1), variant=variant)
+    runs = tables.find_runs([tmp_path / "x"])[0]
+    flags = Flags(runs=(tmp_path / "x",))
+    assert len(legend(plot_curves.learning_figure("p2p", runs, flags).axes[0])) == 2
+    titles = [ax.get_title() for ax in plot_curves.error_figure("p2p", runs, flags).axes]
+    assert len(titles) == 2 and "n_step=1" in "".join(titles)
+
+
 def test_the_symmetry_figure_counts_real_demonstrations_and_partitions(tmp_path):
     one, all_ = (1, 0, 0, 0), (1, 1, 1, 1)
     for i, (success, config) in enumerate((
