@@ -74,17 +74,14 @@ def furnish(client, robot, window, radius):
     floor = pybullet.createMultiBody(0, -1, shape, [0, 0, 0], **id_)
     pybullet.changeVisualShape(floor, -1, textureUniqueId=pybullet.loadTexture(str(FLOOR), **id_), **id_)
 
-    marks = []  # (body, its height above the goal's foot as a function of the goal's height)
-    for shape, height in (
-        (
-            dict(shapeType=pybullet.GEOM_CYLINDER, radius=0.002, length=1.0),
-            lambda z: z - 0.5,
-        ),  # the rest is underground
-        (dict(shapeType=pybullet.GEOM_CYLINDER, radius=radius, length=0.002), lambda z: 0.0),
-        (dict(shapeType=pybullet.GEOM_SPHERE, radius=radius), lambda z: z),
-    )[: 3 if window else 2]:
-        colour = [*GREEN, 0.6 if shape["shapeType"] == pybullet.GEOM_SPHERE else 1]
-        visual = pybullet.createVisualShape(**shape, rgbaColor=colour, **id_)
+    rod = dict(shapeType=pybullet.GEOM_CYLINDER, radius=0.002, length=1.0)  # what is too long of it is underground
+    disc = dict(shapeType=pybullet.GEOM_CYLINDER, radius=radius, length=0.002)
+    ball = dict(shapeType=pybullet.GEOM_SPHERE, radius=radius)
+    marks = []  # (body, its height as a function of the goal's)
+    for shape, opacity, height in (
+        (rod, 1, lambda z: z - 0.5), (disc, 1, lambda z: 0.0), (ball, 0.6, lambda z: z),
+    )[: 3 if window else 2]:  # fmt: skip
+        visual = pybullet.createVisualShape(**shape, rgbaColor=[*GREEN, opacity], **id_)
         marks.append((pybullet.createMultiBody(0, -1, visual, [0, 0, -5], **id_), height))
 
     if window:  # where a link has one colour: the lightest of its shapes
