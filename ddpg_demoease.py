@@ -59,7 +59,7 @@ class Flags(logx.RunFlags):
     batch_size: int = flag(100, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    act_noise: float = flag(0.1, "sigma, standard deviation of the exploration noise", low=0)
+    act_noise: float | None = flag(None, "sigma, standard deviation of the exploration noise; 0.1, robust: 0.2", low=0)
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
@@ -69,6 +69,9 @@ class Flags(logx.RunFlags):
     timeout_ends: bool = flag(False, "a timeout ends bootstrapping too (zeta as Sec. 3.2 prints it)")
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
+    noise_kept: float | None = flag(
+        None, "of the exploration noise of a step in the next; 0, robust: 0.9, over some 0.2 s", low=0, high=1
+    )
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
     keep_clone: float | None = flag(None, "weight of staying near that clone in states of B_o; 0, robust: 10", low=0)
@@ -80,10 +83,10 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "p2po": dict(epochs=500, num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
-PAPER = dict(symmetry="gas", gains="authors", pi_lr=1e-3, demo_noise=0.0, n_step=1, clone_iters=0, keep_clone=0.0,
-             updates_per_step=1.0)  # fmt: skip
-ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-4, demo_noise=0.2, n_step=10, clone_iters=10_000,
-              keep_clone=10.0, updates_per_step=0.25, start_steps=0)  # fmt: skip
+PAPER = dict(symmetry="gas", gains="authors", act_noise=0.1, pi_lr=1e-3, demo_noise=0.0, noise_kept=0.0, n_step=1,
+             clone_iters=0, keep_clone=0.0, updates_per_step=1.0)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_noise=0.2, noise_kept=0.9, n_step=10,
+              clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50))
 
 
@@ -353,7 +356,7 @@ def train(flags):
 def loop(f, run):
     demos, demo_env_steps = (None, 0) if run.checkpoint else pid_demo.demonstrations(f)
     torch.manual_seed(f.seed)
-    rng = np.random.default_rng(f.seed)  # of exploration
+    rng, noise = np.random.default_rng(f.seed), np.zeros(4)  # of exploration
     env = gymnasium.make(TASKS[f.task].env_id, stage="train", max_episode_steps=f.max_ep_len, disable_env_checker=True)
     env = logx.Replayable(env, f.seed)
     learner, B_d = Learner(f), None
@@ -366,7 +369,7 @@ def loop(f, run):
         if state["B_d"]:
             B_d = ReplayBuffer(OBS_DIM[f.task], len(state["B_d"]["rows"]), f.symmetry)
             B_d.load(state["B_d"])
-        rng.bit_generator.state = state["rng"]
+        rng.bit_generator.state, noise = state["rng"], state["noise"].numpy()
         torch.set_rng_state(state["torch_rng"])
     else:
         t, (s, _) = 0, env.reset()
@@ -384,7 +387,9 @@ def loop(f, run):
         if t < f.start_steps:
             a = rng.uniform(-1, 1, 4)
         else:
-            a = np.clip(learner.act(s) + f.act_noise * rng.standard_normal(4), -1, 1)
+            fresh = math.sqrt(1 - f.noise_kept**2) * f.act_noise * rng.standard_normal(4)
+            noise = f.noise_kept * noise + fresh
+            a = np.clip(learner.act(s) + noise, -1, 1)
 
         # step, store
         s, _, terminated, truncated, info = env.step(a.astype(np.float32))
@@ -408,6 +413,7 @@ def loop(f, run):
         if run.must_save(t):
             parts = {"learner": learner.state(), "B_o": B_o.state(), "B_d": B_d and B_d.state(), "env": env.state()}
             parts |= {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
+            parts |= {"noise": torch.from_numpy(noise)}
             run.save(parts, learner.policy())
             run.stop_if_asked(t)
     env.close()

@@ -356,6 +356,18 @@ def test_the_first_actions_are_uniform_and_the_policys_with_noise_of_sigma_come_
 # ---- parts of the robust recipe, each on its own ---------------------------------------------------------------------
 
 
+def test_of_the_exploration_noise_noise_kept_is_in_the_next_steps_and_its_deviation_is_still_sigma(world):
+    run = world("a", start_steps=0, update_after=9999, epochs=60, noise_kept=0.9, act_noise=0.2)
+    act = evaluate.load_policy(run.folder)
+    steps = [(x.a - act(x.s), np.abs(act(x.s)).max() < 0.3) for x in run.steps]
+    noise, free = np.stack([n for n, _ in steps]), np.array([f for _, f in steps])
+    assert free.sum() > 500 and 0.17 < noise[free].std() < 0.23
+    together = free[1:] & free[:-1]
+    before, after = noise[:-1][together], noise[1:][together]
+    assert 0.85 < (before * after).mean() / (before**2).mean() < 0.95
+    assert abs(np.std(after - 0.9 * before) / (0.2 * (1 - 0.81) ** 0.5) - 1) < 0.05
+
+
 def test_updates_per_step_is_kept_up_with(world, blocks):
     """Blocks at 63, 70, ..., 119: floor(0.25 * 119) - floor(0.25 * 56) = 15."""
     world("a", updates_per_step=0.25)
@@ -374,7 +386,7 @@ DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 
 AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1,
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
                     clone_iters=0, keep_clone=0.0,
-                    updates_per_step=1)  # fmt: skip
+                    noise_kept=0, updates_per_step=1)  # fmt: skip
 
 
 @pytest.mark.parametrize("task", DEFAULTS)
