@@ -25,7 +25,7 @@ import evaluate
 import gas
 import logx
 import pid_demo
-from kinova_env import OBS_DIM, TASKS
+from kinova_env import OBS_DIM, TASKS, grasped
 from logx import flag
 
 # ---- flags -----------------------------------------------------------------------------------------------------------
@@ -70,12 +70,14 @@ class Flags(logx.RunFlags):
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     noise_kept: float | None = flag(
-        None, "of the exploration noise of a step in the next; 0, robust: 0.9, over some 0.2 s", low=0, high=1
+        None, "of the exploration noise of a step in the next, 20 ms later; 0, robust: 0.9", low=0, high=1
     )
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
     keep_clone: float | None = flag(None, "weight of staying near that clone in states of B_o; 0, robust: 10", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
+    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of B_d; robust: on pnp")
+    grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
 TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5; epochs of pnp: ours
@@ -84,10 +86,12 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
     "pnp": dict(epochs=250, num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
 PAPER = dict(symmetry="gas", gains="authors", act_noise=0.1, pi_lr=1e-3, demo_noise=0.0, noise_kept=0.0, n_step=1,
-             clone_iters=0, keep_clone=0.0, updates_per_step=1.0)  # fmt: skip
+             clone_iters=0, keep_clone=0.0, updates_per_step=1.0, normalize_obs=False, grasp_input=False)  # fmt: skip
 ROBUST = dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_noise=0.2, noise_kept=0.9, n_step=10,
-              clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0)  # fmt: skip
-ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40), pnp=dict(epochs=50))
+              clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0, normalize_obs=False,
+              grasp_input=False)  # fmt: skip
+ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40),
+                   pnp=dict(epochs=25, normalize_obs=True, grasp_input=True))  # fmt: skip
 
 
 def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
@@ -106,6 +110,8 @@ def resolve(flags):
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
+    if flags.grasp_input and flags.task != "pnp":
+        raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
     if flags.keep_clone and not flags.clone_iters:
         raise logx.BadInput(f"--keep_clone {flags.keep_clone:g}: there is no clone at --clone_iters 0; 0 is allowed")
     return flags
@@ -193,20 +199,28 @@ def mlp(sizes):
 
 
 class ActorCritic(nn.Module):
-    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R."""
+    """pi_mu: s -> a in [-1, 1]^4, and Q_nu: (s, a) -> R, on (s - s_mean) / s_std, and with grasp_input on 1 where the
+    cube is grasped, else 0."""
 
-    def __init__(self, obs_dim, hidden_sizes):
+    def __init__(self, obs_dim, hidden_sizes, grasp_input):
         super().__init__()
-        self.mu_net = mlp([obs_dim, *hidden_sizes, 4])
-        self.q_net = mlp([obs_dim + 4, *hidden_sizes, 1])
+        self.grasp_input = grasp_input
+        self.mu_net = mlp([obs_dim + grasp_input, *hidden_sizes, 4])
+        self.q_net = mlp([obs_dim + grasp_input + 4, *hidden_sizes, 1])
+        self.register_buffer("s_mean", torch.zeros(obs_dim))
+        self.register_buffer("s_std", torch.ones(obs_dim))
+
+    def inputs(self, s):
+        x = (s - self.s_mean) / self.s_std
+        return torch.cat((x, grasped(s).unsqueeze(-1).float()), dim=-1) if self.grasp_input else x
 
     def pi(self, s):
         """pi_mu(s) of s (n, obs_dim): (n, 4). mu_net gives the action before its tanh."""
-        return torch.tanh(self.mu_net(s))
+        return torch.tanh(self.mu_net(self.inputs(s)))
 
     def Q(self, s, a):
         """Q_nu of s (n, obs_dim), a (n, 4): (n,)."""
-        return self.q_net(torch.cat((s, a), dim=-1)).squeeze(-1)
+        return self.q_net(torch.cat((self.inputs(s), a), dim=-1)).squeeze(-1)
 
 
 # ---- losses ----------------------------------------------------------------------------------------------------------
@@ -255,7 +269,7 @@ class Learner:
 
     def __init__(self, flags):
         f = self.flags = flags
-        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes).to(f.device)
+        self.net = ActorCritic(OBS_DIM[f.task], f.hidden_sizes, f.grasp_input).to(f.device)
         self.target = deepcopy(self.net).requires_grad_(False)
         self.clone_net = deepcopy(self.net.mu_net).requires_grad_(False)  # stays as it is after clone()
         self.mu, self.nu = list(self.net.mu_net.parameters()), list(self.net.q_net.parameters())
@@ -285,7 +299,8 @@ class Learner:
         L_C = loss_C(Q, y)
 
         s_demo, a_demo, *_ = B_d.sample(f.demo_batch_size, f.device) if B_d else (s[:0], a[:0])
-        u, u_demo = net.mu_net(torch.cat((s, s_demo))).split((len(s), len(s_demo)))  # one pass costs less than two
+        x = net.inputs(torch.cat((s, s_demo)))  # one pass costs less than two
+        u, u_demo = net.mu_net(x).split((len(s), len(s_demo)))
         a_own, a_hat = torch.tanh(u), torch.tanh(u_demo)
         L_O = loss_O(net.Q(s, a_own))
         with torch.no_grad():
@@ -295,7 +310,7 @@ class Learner:
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
         L_keep = torch.full_like(L_O, math.nan)
         if f.keep_clone and B_d:
-            L_keep = loss_keep(torch.tanh(self.clone_net(s)), a_own)
+            L_keep = loss_keep(torch.tanh(self.clone_net(net.inputs(s))), a_own)
             L_A = L_A + f.keep_clone * L_keep
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
@@ -311,9 +326,13 @@ class Learner:
         )]  # fmt: skip
 
     def clone(self, B_d):
-        """Before the first step: clone_iters updates of the actor on B_d, L_BC with M = 1, at the critic's rate, which
-        falls to 0 (a cosine). Its target begins as this clone too."""
+        """Before the first step: observations are normalised by B_d, then clone_iters updates of the actor on B_d, L_BC
+        with M = 1, at the critic's rate, which falls to 0 (a cosine). Its target begins as this clone too."""
         f, net = self.flags, self.net
+        if f.normalize_obs:
+            s = B_d.rows[:, : B_d.widths[0]]
+            net.s_mean.copy_(s.mean(0))
+            net.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
         optimizer = torch.optim.Adam(self.mu, lr=f.q_lr, fused=True)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):

@@ -166,6 +166,32 @@ def test_cloning_first_fits_the_actor_alone_without_a_mask_at_a_rate_that_falls_
     assert all(map(torch.equal, before, learner.net.q_net.parameters()))
 
 
+def test_normalisation_is_by_mean_and_deviation_of_the_demonstrated_states_or_a_fifth():
+    torch.manual_seed(0)
+    learner = ddpg.Learner(resolve(normalize_obs=True, clone_iters=1, num_demos=4))
+    B_d = ddpg.ReplayBuffer(22, 500, "none")
+    B_d.load({"rows": torch.linspace(-3, 3, 50) + torch.logspace(-2, 4, 50) * torch.randn(500, 50), "next": 0})
+    learner.clone(B_d)
+    seen, std = learner.net.inputs(B_d.rows[:, :22]), B_d.rows[:, :22].std(0)
+    assert 3 < (std > 0.2).sum() < 22  # both cases
+    torch.testing.assert_close(seen.mean(0), torch.zeros(22), rtol=0, atol=1e-4)
+    torch.testing.assert_close(seen.std(0), torch.where(std > 0.2, 1.0, std / 0.2), rtol=1e-4, atol=1e-6)
+    assert torch.equal(learner.target.s_mean, learner.net.s_mean)
+
+
+def test_the_saved_policy_is_the_one_that_acts_normalised_and_told_of_the_grasp():
+    torch.manual_seed(0)
+    s = states(200, 25)
+    s[::2, 22:] = s[::2, 16:19] - s[::2, 19:22]  # in half of the states the cube is grasped
+    learner = ddpg.Learner(resolve(task="pnp", grasp_input=True, hidden_sizes=(16, 16)))
+    learner.net.s_mean.uniform_(-2, 2)
+    learner.net.s_std.uniform_(0.2, 3)
+    policy = evaluate.Policy(learner.policy())
+    x = torch.from_numpy(s)
+    np.testing.assert_allclose(policy(s), learner.net.pi(x).detach(), rtol=0, atol=1e-5)
+    assert learner.net.inputs(x)[:, -1].tolist() == [1, 0] * 100
+
+
 def test_the_mask_picks_the_rows_where_the_demonstrated_action_is_worth_more():
     Q_demo, Q_own = torch.tensor([1.0, 2.0, -1.0, -3.0, 0.0]), torch.tensor([0.5, 2.0, -2.0, -2.0, 1e-6])
     assert ddpg.mask(Q_demo, Q_own).tolist() == [1, 0, 1, 0, 0]  # Eq. 8: <, so not where they are equal
@@ -386,7 +412,7 @@ DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 
 AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batch_size=100, gamma=0.99, act_noise=0.1,
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
                     clone_iters=0, keep_clone=0.0,
-                    noise_kept=0, updates_per_step=1)  # fmt: skip
+                    noise_kept=0, updates_per_step=1, normalize_obs=False, grasp_input=False)  # fmt: skip
 
 
 @pytest.mark.parametrize("task", DEFAULTS)
@@ -405,8 +431,9 @@ def test_a_very_short_episode_still_updates():
 
 @pytest.mark.parametrize("flags, says", [
     (dict(keep_clone=1.0), "--keep_clone 1: there is no clone at --clone_iters 0"),
+    (dict(grasp_input=True), "--grasp_input: --task p2p has nothing to grasp; allowed on --task pnp"),
     (dict(num_demos=4, replay_size=10), "--replay_size 10: must hold the 18 demonstrated steps"),
-], ids=["no clone", "B_o too small"])  # fmt: skip
+], ids=["no clone", "nothing to grasp", "B_o too small"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ddpg, tmp_path, "a", recorded=demo_arrays(), **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()
