@@ -26,7 +26,7 @@ import zipfile
 import zlib
 from contextlib import contextmanager
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pandas as pd
@@ -491,15 +491,16 @@ def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
     lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "command", "minutes"]]
     for task in TASKS:
-        printed, best = columns(task), best_column(task)
-        (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
-        script, of_task = f"{best.algo}_demoease.py --task {task}", runs[(runs.task == task) & (runs.variant == "")]
-        agents = []
-        for recipe, name in (("robust", "robust"), ("paper", "as published")):
-            group = main_group(task, of_task[of_task.algo == best.algo], recipe)
-            agents += [(f"Demo-EASE, {name}", best, group, f"{script} --recipe {recipe}"),
-                       (f"{best.algo.upper()}, {name}", plain, group,
-                        f"{script} --recipe {recipe} --num_demos 0 --lambda_bc 0")]  # fmt: skip
+        printed = columns(task)
+        plain, pid, best = (next(printed[rows].itertuples()) for rows in (
+            printed.sweep == "baseline", printed.sweep == "pid", printed.R90.max() == printed.R90))  # fmt: skip
+        of_task, agents = runs[(runs.task == task) & (runs.variant == "")], []
+        for (recipe, name), algo in product((("robust", "robust"), ("paper", "as published")), ("ddpg", "ppo")):
+            group = main_group(task, of_task[of_task.algo == algo], recipe)
+            command = f"{algo}_demoease.py --task {task} --recipe {recipe}"
+            agents += [(f"Demo-EASE {algo.upper()}, {name}", best._replace(algo=algo), group, command),
+                       (f"{algo.upper()}, {name}", plain._replace(algo=algo), group,
+                        f"{command} --num_demos 0 --lambda_bc 0")]  # fmt: skip
         agents += [(f"PID, {gains} gains", pid, of_task[of_task.recipe == gains],
                     f"evaluate.py --pid --task {task} --gains {gains}") for gains in ("authors", "fast")]  # fmt: skip
         for name, column, group, command in agents:
