@@ -59,7 +59,7 @@ class Flags(logx.RunFlags):
     batch_size: int = flag(100, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    act_noise: float | None = flag(None, "sigma, standard deviation of the exploration noise; 0.1, robust: 0.2", low=0)
+    act_noise: float | None = flag(None, "sigma, standard deviation of the exploration noise; 0.1, robust: 0.2, p2po: 0.1", low=0)
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
@@ -90,7 +90,7 @@ PAPER = dict(symmetry="gas", gains="authors", act_noise=0.1, pi_lr=1e-3, demo_no
 ROBUST = dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_noise=0.2, noise_kept=0.9, n_step=10,
               clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0, normalize_obs=False,
               grasp_input=False)  # fmt: skip
-ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40),
+ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40, act_noise=0.1),
                    pnp=dict(epochs=25, normalize_obs=True, grasp_input=True))  # fmt: skip
 
 
