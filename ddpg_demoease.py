@@ -59,7 +59,7 @@ class Flags(logx.RunFlags):
     batch_size: int = flag(100, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    act_noise: float | None = flag(None, "sigma, deviation of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0)
+    act_noise: float | None = flag(None, "sigma, of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0)
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
