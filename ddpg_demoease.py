@@ -59,7 +59,7 @@ class Flags(logx.RunFlags):
     batch_size: int = flag(100, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    act_noise: float | None = flag(None, "sigma, of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0)
+    act_noise: float | None = flag(None, "sigma of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0)
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
@@ -310,7 +310,7 @@ class Learner:
         L_A = loss_A(L_O, L_BC, f.lambda_bc) if B_d else L_O
         L_keep = torch.full_like(L_O, math.nan)
         if f.keep_clone and B_d:
-            L_keep = loss_keep(torch.tanh(self.clone_net(net.inputs(s))), a_own)
+            L_keep = loss_keep(torch.tanh(self.clone_net(x[: len(s)])), a_own)
             L_A = L_A + f.keep_clone * L_keep
         # Both gradients before either step, as Alg. 1 prints it; L_A moves the actor alone.
         self.optimizer.zero_grad()
@@ -388,7 +388,7 @@ def loop(f, run):
         if state["B_d"]:
             B_d = ReplayBuffer(OBS_DIM[f.task], len(state["B_d"]["rows"]), f.symmetry)
             B_d.load(state["B_d"])
-        rng.bit_generator.state, noise = state["rng"], state["noise"].numpy()
+        rng.bit_generator.state, noise = state["rng"], np.array(state["noise"])
         torch.set_rng_state(state["torch_rng"])
     else:
         t, (s, _) = 0, env.reset()
@@ -431,8 +431,8 @@ def loop(f, run):
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
         if run.must_save(t):
             parts = {"learner": learner.state(), "B_o": B_o.state(), "B_d": B_d and B_d.state(), "env": env.state()}
-            parts |= {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
-            parts |= {"noise": torch.from_numpy(noise)}
+            parts |= {"t": t, "noise": noise.tolist(), "rng": rng.bit_generator.state,
+                      "torch_rng": torch.get_rng_state()}  # fmt: skip
             run.save(parts, learner.policy())
             run.stop_if_asked(t)
     env.close()

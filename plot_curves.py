@@ -184,7 +184,7 @@ def success_figure(task, runs, flags):
     best = tables.best_column(task)
     runs = runs[[len(curves.validation) > 0 for curves in runs.curves]]
     plain, other = (runs.num_demos == 0) & (runs.lambda_bc == 0), runs.algo != best.algo
-    at_best = (runs[COLUMN] == best[COLUMN].to_list()).all(axis=1)
+    at_best = (runs[COLUMN] == [getattr(best, name) for name in COLUMN]).all(axis=1)
     shown, lines = runs if flags.runs else runs[plain | other | at_best], {}
     for (algo, *rest, N, lam), members in shown.groupby([*GROUP[:-1], *COLUMN[1:]]):
         members = members[members.total_env_steps == members.total_env_steps.max()]
@@ -284,9 +284,11 @@ def error_figure(task, runs, flags):
     for ax in figure.axes:
         ax.label_outer()
         ax.set_visible(ax.has_data())
-    hidden = "" if of_all else title(figure, task, group, runs)
     if of_all:
+        hidden = ""
         figure.suptitle(TITLES[task], fontsize=9)
+    else:
+        hidden = title(figure, task, group, runs)
     caption(figure, r"Mean $\pm$ standard deviation over all successful test trials; dotted: $\epsilon$. A trial that "
             "has ended keeps its last error.", hidden)  # fmt: skip
     return figure

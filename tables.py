@@ -222,9 +222,8 @@ def of_column(runs, column):
 
 
 def best_column(task):
-    """The printed column with the highest R90."""
-    found = columns(task)
-    return found.loc[found.R90.idxmax()]
+    """The printed column with the highest R90, a row as `itertuples` gives it."""
+    return next(columns(task).nlargest(1, "R90").itertuples())
 
 
 # ---- metrics ---------------------------------------------------------------------------------------------------------
@@ -491,9 +490,8 @@ def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
     lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "command", "minutes"]]
     for task in TASKS:
-        printed = columns(task)
-        plain, pid, best = (next(printed[rows].itertuples()) for rows in (
-            printed.sweep == "baseline", printed.sweep == "pid", printed.R90.max() == printed.R90))  # fmt: skip
+        printed, best = columns(task), best_column(task)
+        (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
         of_task, agents = runs[(runs.task == task) & (runs.variant == "")], []
         for (recipe, name), algo in product((("robust", "robust"), ("paper", "as published")), ("ddpg", "ppo")):
             group = main_group(task, of_task[of_task.algo == algo], recipe)
