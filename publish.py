@@ -64,7 +64,10 @@ def files_of_run(folder):
         files["policy.pt"] = (folder / "policy.pt").read_bytes()
     for path in sorted(folder.glob("*.csv")):
         files[f"{path.name}.gz"] = gzip.compress(path.read_bytes(), mtime=0)  # the same bytes each time
-    if "" in run.evaluations and run.trajectories.exists() and not run.row["variant"]:  # the successful trials alone
+    printed = tables.columns(run.row["task"])
+    drawn = run.row["variant"] == "" and ((run.row["num_demos"], run.row["lambda_bc"])
+                                          in set(zip(printed.num_demos, printed.lambda_bc, strict=True)))  # fmt: skip
+    if "" in run.evaluations and run.trajectories.exists() and drawn:  # the successful trials alone
         won = run.evaluations[""].query("success == 1")
         errors, (_, paths) = tables.read_errors(run.trajectories), tables.read_paths(run.trajectories)
         if [len(error) - 1 for error in errors] != won.length.to_list():

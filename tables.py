@@ -130,7 +130,7 @@ class Curves:
 
     @cached_property
     def episodes(self):
-        return read_csv(self.folder / "episodes.csv", ("episode", "env_steps", "return", "length"))
+        return read_csv(self.folder / "episodes.csv", ("episode", "env_steps", "return", "length", "success"))
 
     @cached_property
     def progress(self):
@@ -150,6 +150,11 @@ class Curves:
     def success(self):
         """P_scs of the test study in percent; NaN where there was none."""
         return evaluate.metrics(self.evaluations[""])["P_scs_percent"] if "" in self.evaluations else math.nan
+
+    @property
+    def own_success(self):
+        """Percent of the own episodes while training that succeeded, exploration and all."""
+        return 100 * self.episodes.success.mean()
 
     @cached_property
     def validation(self):
@@ -370,24 +375,29 @@ def undecided(kind, rows):
 
 
 def compared_lines(by, runs):
-    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: final test success by seed, its mean,
-    and Welch's difference from the recipe or from no symmetry."""
+    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: success in the test study, and of all
+    own episodes while training, each with Welch's difference from the recipe or from no symmetry, at as many steps or
+    else at its most."""
     runs, order = runs[(runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))], ("", "none", "gas", "so2")
+    base, alike = {"variant": "", "symmetry": "none"}[by], [n for n in GROUP[:-1] if n != by]
     lines = [["group", "N_demos", "lambda_BC", by, "success in the test study, by seed (%)", "mean", "difference",
-              "90 % in training at steps"]]  # fmt: skip
-    for (*group, N, lam), members in runs.groupby([name for name in [*GROUP, *COLUMN[1:]] if name != by]):
-        found = {value: [run.curves for run in part.itertuples()] for value, part in members.groupby(by)}
-        if len(found) == 1 and (by == "symmetry" or "" in found):
-            continue
-        reference = [curves.success for curves in found.get("none" if by == "symmetry" else "", ())]
-        for value in sorted(found, key=lambda value: (order.index(value) if value in order else len(order), value)):
-            values = [curves.success for curves in found[value]]
-            reached = [curves.validation.index[curves.validation >= 90] for curves in found[value]]
-            gap = evaluate.difference(values, reference) if value not in ("", "none") else [math.nan] * 3
-            lines.append([group_label(group), f"{N}", f"{lam:g}", value or "the recipe's",
-                          " ".join("-" if x != x else f"{x:.1f}" for x in values),
-                          between(*over_seeds("P_scs_percent", values), 1), between(*gap, 1),
-                          " ".join(f"{steps[0]:,}" if len(steps) else "never" for steps in reached)])  # fmt: skip
+              "success while training (%)", "difference"]]  # fmt: skip
+    for (*group, N, lam), members in runs.groupby([*alike, *COLUMN[1:]]):
+        found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1]])}
+        if len({value for value, _ in found}) == 1 and (by == "symmetry" or "" in members.variant.values):
+            continue  # nothing to compare
+        bases = {steps: part for (value, steps), part in found.items() if value == base}
+        rank = {value: i for i, value in enumerate(order)}
+        for (value, steps), part in sorted(found.items(), key=lambda item: (rank.get(item[0][0], 9), item[0])):
+            reference = bases.get(steps, bases.get(max(bases, default=0), ())) if value != base else ()
+            cells = []
+            for name in ("success", "own_success"):
+                values, others = ([getattr(curves, name) for curves in side] for side in (part, reference))
+                cells += [between(*over_seeds("P_scs_percent", values), 1),
+                          between(*evaluate.difference(values, others), 1)]  # fmt: skip
+            by_seed = " ".join("-" if (x := curves.success) != x else f"{x:.1f}" for curves in part)
+            lines.append([" ".join(filter(None, group)), f"{N}", f"{lam:g}",
+                          group_label([value or "the recipe's", steps]), by_seed, *cells])  # fmt: skip
     return lines
 
 

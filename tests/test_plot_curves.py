@@ -43,14 +43,16 @@ def trials(success):
     return HEADER + "".join(f"{i},{won},,0,{3 + i},{10 + i},{20 + i},5,6\n" for i, won in enumerate(success))
 
 
-def write_run(folder, returns=(1.0,) * 60, steps=4000, success=None, columns="L_C,Q_mean", validated=0.5, **config):
-    """A run folder like a training script's; `steps`: environment steps after the last epoch; success: of each trial in
-    evaluation.csv and trajectories.npz, where the error falls from 50 cm to 5 cm in equal steps."""
+def write_run(folder, returns=(1.0,) * 60, steps=4000, success=None, own=(0,), columns="L_C,Q_mean",
+              validated=0.5, **config):  # fmt: skip
+    """A run folder like a training script's; `steps`: environment steps after the last epoch; own: success of own
+    episodes, in turn; success: of each trial in evaluation.csv and trajectories.npz, where the error falls from 50 to 5
+    cm in equal steps."""
     folder.mkdir(parents=True)
     config = {**CONFIG, "versions": {"git_commit": COMMIT}, **config} if config != PID else PID
     (folder / "config.json").write_text(json.dumps(config))
     if config != PID:
-        rows = "".join(f"{i},{20 * i},{value},20,0,\n" for i, value in enumerate(returns, start=1))
+        rows = "".join(f"{i},{20 * i},{value},20,{own[i % len(own)]},\n" for i, value in enumerate(returns, start=1))
         (folder / "episodes.csv").write_text("episode,env_steps,return,length,success,collision\n" + rows)
         (folder / "progress.csv").write_text(
             f"epoch,env_steps,demo_env_steps,seconds,{columns},eval_success,eval_return\n"
@@ -218,13 +220,16 @@ def test_pairs_that_the_paper_ranks_are_listed_where_the_difference_may_be_0(tmp
 
 def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers_tables(tmp_path):
     for seed in (0, 1):
-        write_run(tmp_path / f"runs/a{seed}", seed=seed, success=(1, 1))
-        write_run(tmp_path / f"runs/b{seed}", seed=seed, success=(1, 0), variant="n_step=1")
+        write_run(tmp_path / f"runs/a{seed}", seed=seed, success=(1, 1), own=(1, 1))
+        write_run(tmp_path / f"runs/b{seed}", seed=seed, success=(1, 0), own=(1, 0), variant="n_step=1")
+    write_run(tmp_path / "runs/short", seed=0, success=(0, 0), epochs=1, steps=2000, variant="pi_lr=0.0")
     runs, _ = tables.find_runs()
     lines = tables.compared_lines("variant", runs)
-    assert [line[3:7] for line in lines[1:]] == [
-        ["the recipe's", "100.0 100.0", "100.0 [100.0, 100.0]", "-"],
-        ["n_step=1", "50.0 50.0", "50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]]  # fmt: skip
+    same, half = "100.0 [100.0, 100.0]", ["50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]
+    assert [line[3:] for line in lines[1:]] == [
+        ["the recipe's 4k steps", "100.0 100.0", same, "-", same, "-"],
+        ["n_step=1 4k steps", "50.0 50.0", *half, *half],
+        ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "0.0 [-]", "-100.0 [-]"]]  # fmt: skip
     assert table("test").seeds.max() == 2 and "n_step" not in tables.make_table("test", "p2p", runs)[0]
 
 
@@ -232,7 +237,8 @@ def test_symmetries_are_compared_with_none(tmp_path):
     for symmetry, success in (("none", (0, 0)), ("gas", (1, 0)), ("canonical", (1, 1))):
         write_run(tmp_path / f"runs/{symmetry}", symmetry=symmetry, success=success)
     lines = tables.compared_lines("symmetry", tables.find_runs()[0])[1:]
-    assert [(line[3], line[6]) for line in lines] == [("none", "-"), ("gas", "50.0 [-]"), ("canonical", "100.0 [-]")]
+    assert [(line[3].split()[0], line[6]) for line in lines] == [
+        ("none", "-"), ("gas", "50.0 [-]"), ("canonical", "100.0 [-]")]  # fmt: skip
 
 
 @pytest.mark.parametrize("ours, verdict", [
@@ -490,6 +496,13 @@ def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_
     assert [row[k] for k in ("name", "num_demos", "env_steps", "finished", "eval_success", "P_scs_percent")] == [
         "a", "100", "4000", "1", "0.5", "50"]  # fmt: skip
     assert row["git_commit"] == COMMIT
+
+
+@pytest.mark.parametrize("config", [{"num_demos": 7}, {"variant": "n_step=1"}])
+def test_trajectories_are_published_of_what_a_figure_may_show(tmp_path, config):
+    main(["--publish", str(publishable(tmp_path / "runs/a", **config))])
+    assert (tmp_path / "results/a/evaluation.csv.gz").exists()
+    assert not (tmp_path / "results/a/trajectories.npz").exists()
 
 
 def test_a_run_without_a_successful_trial_is_published_and_drawn(tmp_path):
