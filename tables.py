@@ -523,6 +523,32 @@ def results_lines(runs):
     return lines
 
 
+WATCHED = {"action before its bound": ("pretanh_own", "mean_action_own"), "mask, fraction": ("mask_fraction",),
+           "cloning error": ("bc_relative_error",), "largest value": ("Q_max", "V_max")}  # fmt: skip
+
+
+def watched_lines(runs):
+    """What went on inside the first page's agents: each quantity after a tenth of the run, half of it, all of it."""
+    lines = [["task", "agent", *WATCHED, "own success (%)"]]
+    for task, recipe, algo in product(TASKS, ("robust", "paper"), ("ddpg", "ppo")):
+        of_recipe = runs[(runs.task == task) & (runs.variant == "") & (runs.algo == algo)]
+        part = of_column(main_group(task, of_recipe, recipe), best_column(task)._replace(algo=algo))
+        tables, cells = [run.progress for run in part.curves], []
+        for names in (*WATCHED.values(), ("Success",)) if tables else ():
+            at = [np.nanmean([_near(table, name, share) for table in tables for name in names if name in table])
+                  for share in (0.1, 0.5, 1)]  # fmt: skip
+            at = np.multiply(at, 100) if names == ("Success",) else at
+            cells.append(", ".join(f"{x:.2g}" if x < 99.5 else f"{x:.0f}" for x in at))
+        lines += [[TITLES[task], f"{algo.upper()}, {recipe}", *cells]] * bool(cells)
+    return lines
+
+
+def _near(table, name, share):
+    """Mean of a column of progress.csv over the tenth of the rows that ends at this share of them."""
+    end = math.ceil(share * len(table))
+    return table[name].iloc[max(0, end - math.ceil(len(table) / 10)) : end].mean()
+
+
 def pid_lines(runs):
     """The demonstrator in the test study and in other ones."""
     lines = [["task", "", *METRICS["test"], "steps"]]
@@ -561,4 +587,5 @@ def gaps(task, runs):
 BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
           for kind in (*METRICS, *COMPARED) for task in TASKS}  # fmt: skip
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
-    ("results", results_lines), ("findings", findings_lines), ("demonstrator", pid_lines))}  # fmt: skip
+    ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines),
+    ("demonstrator", pid_lines))}  # fmt: skip
