@@ -533,20 +533,20 @@ def watched_lines(runs):
     for task, recipe, algo in product(TASKS, ("robust", "paper"), ("ddpg", "ppo")):
         of_recipe = runs[(runs.task == task) & (runs.variant == "") & (runs.algo == algo)]
         part = of_column(main_group(task, of_recipe, recipe), best_column(task)._replace(algo=algo))
-        tables, cells = [run.progress for run in part.curves], []
-        for names in (*WATCHED.values(), ("Success",)) if tables else ():
-            at = [np.nanmean([_near(table, name, share) for table in tables for name in names if name in table])
-                  for share in (0.1, 0.5, 1)]  # fmt: skip
-            at = np.multiply(at, 100) if names == ("Success",) else at
+        histories, cells = [run.progress for run in part.curves], []
+        for names in (*WATCHED.values(), ("Success",)) if histories else ():
+            unit = 100 if names == ("Success",) else 1
+            at = [unit * pd.Series([_near(history[name], share) for history in histories for name in names
+                                    if name in history], dtype=float).mean() for share in (0.1, 0.5, 1)]  # fmt: skip
             cells.append(", ".join(f"{x:.2g}" if x < 99.5 else f"{x:.0f}" for x in at))
         lines += [[TITLES[task], f"{algo.upper()}, {recipe}", *cells]] * bool(cells)
     return lines
 
 
-def _near(table, name, share):
-    """Mean of a column of progress.csv over the tenth of the rows that ends at this share of them."""
-    end = math.ceil(share * len(table))
-    return table[name].iloc[max(0, end - math.ceil(len(table) / 10)) : end].mean()
+def _near(values, share):
+    """Mean over the tenth of a column of progress.csv that ends at this share of it."""
+    end = math.ceil(share * len(values))
+    return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
 
 
 def pid_lines(runs):

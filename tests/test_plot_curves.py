@@ -252,6 +252,14 @@ def test_a_finding_is_what_the_interval_of_the_difference_says(tmp_path, ours, v
     assert found["The agent beats its demonstrator"] == f"*{verdict}*" and found["The mask matters"] == ""
 
 
+def test_what_went_on_inside_is_shown_after_a_tenth_half_and_all_of_a_run(tmp_path):
+    run = write_run(tmp_path / "runs/a")
+    rows = "".join(f"{i},{200 * i},0,{i},{i},nan\n" for i in range(1, 21))
+    (run / "progress.csv").write_text("epoch,env_steps,demo_env_steps,seconds,Q_max,eval_success\n" + rows)
+    (line,) = [line for line in tables.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
+    assert line[1] == "DDPG, robust" and line[5] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
+
+
 # ---- which runs ------------------------------------------------------------------------------------------------------
 
 
