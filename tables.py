@@ -26,7 +26,7 @@ import zipfile
 import zlib
 from contextlib import contextmanager
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -427,65 +427,7 @@ def markdown(lines):
     return "\n".join("| " + " | ".join(line) + " |" for line in [lines[0], ["---"] * len(lines[0]), *lines[1:]])
 
 
-# ---- the pages' tables -----------------------------------------------------------------------------------------------
-
-CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
-    "lambda": "A larger λ_BC is better",
-    "demos": "More demonstrations are better",
-    "plain": "Demo-EASE beats the plain algorithm",
-    "mask": "The mask matters",
-    "symmetry": "Symmetric demonstrations cost less",
-    "PID": "The agent beats its demonstrator",
-}
-
-
-def comparisons(task, runs):
-    """(claim, what is compared, one side, the other) that a task's runs allow; a side: list of Curves, or None."""
-    best, printed = best_column(task), columns(task)
-    pid = {run.recipe: [run.curves] for run in runs.itertuples() if run.algo == "pid"}
-    at = {group: {key: list(part.curves) for key, part in members.groupby(COLUMN[1:])}
-          for group, members in runs[runs.algo == best.algo].groupby(GROUP)}  # fmt: skip
-    key, ends = (best.num_demos, best.lambda_bc), {}
-    for sweep, value in (("lambda", "lambda_bc"), ("demos", "num_demos")):
-        rows = printed[printed.sweep == sweep].sort_values(value)
-        ends[sweep] = [(row.num_demos, row.lambda_bc) for row in (rows.iloc[-1], rows.iloc[0])]
-    for group, found in at.items():
-        (algo, recipe, symmetry, variant, total), label = group, group_label(group)
-        if variant.startswith("mask="):
-            sides = at.get((algo, recipe, symmetry, "", total), {}).get(key), found.get(key)
-            yield "mask", f"{label}: with it, and without", *(sides if variant == "mask=none" else sides[::-1])
-        if variant:
-            continue
-        for sweep, (high, low) in ends.items():
-            names = [f"{N} demonstrations, λ_BC = {lam:g}" for N, lam in (high, low)]
-            yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low)
-        yield "plain", f"{label}: with demonstrations, and without", found.get(key), found.get((0, 0.0))
-        for (N, lam), curves in found.items() if symmetry == "gas" else ():
-            real = N // curves[0].config["partitions"]
-            unmapped = at.get((algo, recipe, "none", "", total), {}).get((real, lam))
-            yield "symmetry", f"{label}: {real} demonstrations, mapped to {N} and as they are", curves, unmapped
-        gains = found[key][0].config["gains"] if key in found else None
-        yield "PID", f"{label}, and the PID with {gains} gains", found.get(key), pid.get(gains)
-
-
-def findings_lines(runs):
-    """Each claim of the paper, the difference in our test success (Welch's interval over seeds), and what it says."""
-    lines, said = [["the paper's claim", "task", "compared", "difference, points", "seeds", ""]], {}
-    found = ((task, *sides) for task in TASKS for sides in comparisons(task, runs[runs.task == task]))
-    for title, claim, compared, one, other in found:
-        if not (one and other):
-            continue
-        ours, theirs = ([curves.success for curves in side] for side in (one, other))
-        gap, low, high = evaluate.difference(ours, theirs)
-        if claim == "PID":  # one controller, whose success is taken as known
-            gap, low, high = evaluate.over_seeds(np.subtract(ours, theirs[0]))
-        verdict = "holds" if low > 0 else "does not hold" if high < 0 else "cannot be told apart"
-        seeds = f"{len(ours)}" if claim == "PID" else f"{len(ours)} and {len(theirs)}"
-        said.setdefault(claim, []).append([TITLES[title], compared, between(gap, low, high, 1), seeds,
-                                           f"*{verdict if low == low else 'too few seeds'}*"])  # fmt: skip
-    for claim, sentence in CLAIMS.items():
-        lines += [[sentence, *line] for line in said.get(claim, [["", "no runs", "", "", ""]])]
-    return lines
+# ---- a task's runs as a whole ----------------------------------------------------------------------------------------
 
 
 def main_group(task, runs, recipe=None):
@@ -494,73 +436,6 @@ def main_group(task, runs, recipe=None):
     printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
     sizes = (printed if len(printed) else runs).groupby(GROUP).size().sort_values(kind="stable")
     return runs[(runs[GROUP] == list(sizes.index[-1])).all(axis=1)] if len(sizes) else runs
-
-
-def results_lines(runs):
-    """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
-    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "command", "minutes"]]
-    for task in TASKS:
-        printed, best = columns(task), best_column(task)
-        (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
-        of_task, agents = runs[(runs.task == task) & (runs.variant == "")], []
-        for (recipe, name), algo in product((("robust", "robust"), ("paper", "as published")), ("ddpg", "ppo")):
-            group = main_group(task, of_task[of_task.algo == algo], recipe)
-            command = f"{algo}_demoease.py --task {task} --recipe {recipe}"
-            agents += [(f"Demo-EASE {algo.upper()}, {name}", best._replace(algo=algo), group, command),
-                       (f"{algo.upper()}, {name}", plain._replace(algo=algo), group,
-                        f"{command} --num_demos 0 --lambda_bc 0")]  # fmt: skip
-        agents += [(f"PID, {gains} gains", pid, of_task[of_task.recipe == gains],
-                    f"evaluate.py --pid --task {task} --gains {gains}") for gains in ("authors", "fast")]  # fmt: skip
-        for name, column, group, command in agents:
-            rows, part = table("test", task, of_column(group, column)), of_column(group, column)
-            found = rows[(rows.metric == "P_scs_percent") & (rows.evaluation == "") & (rows.seeds > 0)]
-            minutes = [run.progress.seconds.max() / 60 for run in part.curves if not run.pid]
-            for row in found.iloc[:1].to_dict("records"):
-                lines.append([TITLES[task], name, "-" if row["paper"] != row["paper"] else f"{row['paper']:g}",
-                              between(row["mean"], row["low"], row["high"], 1),
-                              f"{row['seeds']}" + " (unfinished)" * bool(row["unfinished"]), f"`{command}`",
-                              f"{np.median(minutes):.0f}" if minutes else "-"])  # fmt: skip
-    return lines
-
-
-WATCHED = {"action before its bound": ("pretanh_own", "mean_action_own"), "mask, fraction": ("mask_fraction",),
-           "cloning error": ("bc_relative_error",), "largest value": ("Q_max", "V_max")}  # fmt: skip
-
-
-def watched_lines(runs):
-    """What went on inside the first page's agents: each quantity after a tenth of the run, half of it, all of it."""
-    lines = [["task", "agent", *WATCHED, "own success (%)"]]
-    for task, recipe, algo in product(TASKS, ("robust", "paper"), ("ddpg", "ppo")):
-        of_recipe = runs[(runs.task == task) & (runs.variant == "") & (runs.algo == algo)]
-        part = of_column(main_group(task, of_recipe, recipe), best_column(task)._replace(algo=algo))
-        histories, cells = [run.progress for run in part.curves], []
-        for names in (*WATCHED.values(), ("Success",)) if histories else ():
-            unit = 100 if names == ("Success",) else 1
-            at = [unit * pd.Series([_near(history[name], share) for history in histories for name in names
-                                    if name in history], dtype=float).mean() for share in (0.1, 0.5, 1)]  # fmt: skip
-            cells.append(", ".join(f"{x:.2g}" if x < 99.5 else f"{x:.0f}" for x in at))
-        lines += [[TITLES[task], f"{algo.upper()}, {recipe}", *cells]] * bool(cells)
-    return lines
-
-
-def _near(values, share):
-    """Mean over the tenth of a column of progress.csv that ends at this share of it."""
-    end = math.ceil(share * len(values))
-    return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
-
-
-def pid_lines(runs):
-    """The demonstrator in the test study and in other ones."""
-    lines = [["task", "", *METRICS["test"], "steps"]]
-    for run in runs[runs.algo == "pid"].sort_values(["task", "recipe"]).itertuples():
-        (printed,) = columns(run.task).query("sweep == 'pid'").to_dict("records")
-        if TITLES[run.task] not in [line[0] for line in lines]:
-            lines.append([TITLES[run.task], "paper", *(f"{printed[m]:g}" for m in METRICS["test"]), ""])
-        for what, trials in run.curves.evaluations.items():
-            metrics, ends = evaluate.metrics(trials), evaluate.over_trials(trials)
-            cells = [between(metrics[m], *ends[m], digits) for m, digits in {**METRICS["test"], "steps": 0}.items()]
-            lines.append([TITLES[run.task], f"{run.recipe} gains" + f", {what}" * bool(what), *cells])
-    return lines
 
 
 def gaps(task, runs):
@@ -582,10 +457,3 @@ def gaps(task, runs):
         lines += [f"python pid_demo.py --task {task} --record 40 --gains fast --out data/demos-{task}.npz",
                   f"python plot_curves.py --publish data/demos-{task}.npz"]  # fmt: skip
     return ["", f"{TITLES[task]}: to fill the gaps", *("    " + line for line in lines)] if lines else []
-
-
-BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
-          for kind in (*METRICS, *COMPARED) for task in TASKS}  # fmt: skip
-BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
-    ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines),
-    ("demonstrator", pid_lines))}  # fmt: skip

@@ -248,7 +248,7 @@ def test_a_finding_is_what_the_interval_of_the_difference_says(tmp_path, ours, v
     for seed, success in enumerate(ours):
         write_run(tmp_path / f"runs/{seed}", seed=seed, success=success)
     write_run(tmp_path / "runs/pid", success=(1, 0), **PID)
-    found = {line[0]: line[-1] for line in tables.findings_lines(tables.find_runs()[0])}
+    found = {line[0]: line[-1] for line in publish.findings_lines(tables.find_runs()[0])}
     assert found["The agent beats its demonstrator"] == f"*{verdict}*" and found["The mask matters"] == ""
 
 
@@ -256,7 +256,7 @@ def test_what_went_on_inside_is_shown_after_a_tenth_half_and_all_of_a_run(tmp_pa
     run = write_run(tmp_path / "runs/a")
     rows = "".join(f"{i},{200 * i},0,{i},{i},nan\n" for i in range(1, 21))
     (run / "progress.csv").write_text("epoch,env_steps,demo_env_steps,seconds,Q_max,eval_success\n" + rows)
-    (line,) = [line for line in tables.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
+    (line,) = [line for line in publish.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
     assert line[1] == "DDPG, robust" and line[5] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
 
 
@@ -627,8 +627,8 @@ def test_named_runs_of_another_task_only_are_an_error(tmp_path):
 @pytest.mark.parametrize("file, content, says", [
     ("config.json", "{", "JSON"), ("config.json", "5", "config.json"), ("config.json", '{"algo": "ddpg"}', "'task'"),
     ("episodes.csv", "episode,length\n1,2\n", "return"), ("episodes.csv", "\udcff\udcfe", "episodes.csv"),
-    ("episodes.csv", "episode,env_steps,return,length\n1,1,oops,1\n2,2,1,1\n", "oops"),
-    ("episodes.csv", "episode,env_steps,return,length\n1,1,,1\n2,2,1,1\n", "no number in line 2"),
+    ("episodes.csv", "episode,env_steps,return,length,success\n1,1,oops,1,0\n2,2,1,1,0\n", "oops"),
+    ("episodes.csv", "episode,env_steps,return,length,success\n1,1,,1,0\n2,2,1,1,0\n", "no number in line 2"),
     ("progress.csv", None, "no such file"), ("evaluation.csv", "trial,success\n0,1\n", "length"),
 ])  # fmt: skip
 def test_a_bad_file_is_one_line_that_names_it_and_nothing_is_written(tmp_path, file, content, says):
