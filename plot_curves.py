@@ -13,10 +13,10 @@ in --table ablations alone then. What the numbers are, and which runs form a
 group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
-where NAME is results, findings, watched, demonstrator, figures, or training,
-test, ablations, symmetries, figures with -p2p, -p2po, -pnp. --report rewrites
-what is between them in README.md, DIFFERENCES.md and data/results/README.md
-from data/results, and draws the figures there.
+where NAME is results, findings, watched, demonstrator, cost, figures, or
+training, test, ablations, symmetries, figures with -p2p, -p2po, -pnp. --report
+rewrites what is between them in README.md, DIFFERENCES.md and
+data/results/README.md from data/results, and draws the figures there.
 """
 
 import math

@@ -254,6 +254,17 @@ def _near(values, share):
     return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
 
 
+def cost_lines(runs):
+    """What the published runs took on one core, validation trials included, the test study not."""
+    lines = [["task", "algorithm", "recipe", "runs", "environment steps", "core-hours"]]
+    trained = runs[runs.algo != "pid"]
+    for (task, algo, recipe), part in trained.groupby(["task", "algo", "recipe"]):
+        seconds = sum(run.progress.seconds.max() for run in part.curves)
+        lines.append([TITLES[task], algo, recipe, f"{len(part)}", f"{part.steps.sum():,}", f"{seconds / 3600:.1f}"])
+    seconds = sum(run.progress.seconds.max() for run in trained.curves)
+    return [*lines, ["all", "", "", f"{len(trained)}", f"{trained.steps.sum():,}", f"{seconds / 3600:.1f}"]]
+
+
 def pid_lines(runs):
     """The demonstrator in the test study and in other ones."""
     lines = [["task", "", *METRICS["test"], "steps"]]
@@ -271,7 +282,7 @@ def pid_lines(runs):
 BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
           for kind in (*METRICS, *COMPARED) for task in TASKS}  # fmt: skip
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
-    ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines),
+    ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines), ("cost", cost_lines),
     ("demonstrator", pid_lines))}  # fmt: skip
 
 
