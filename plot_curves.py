@@ -213,18 +213,14 @@ def success_figure(task, runs, flags):
 
 def symmetry_figure(task, runs, flags):
     """Test success over the number of real demonstrations, a line a symmetry; and of `gas` over the number of
-    partitions K, at as many real demonstrations and at as many after mapping. Robust runs of most steps."""
+    partitions K, at as many real demonstrations and at as many after mapping. Robust runs of the commonest length."""
     best = tables.best_column(task)
     runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
     runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
-    runs = runs.assign(success=[curves.success for curves in runs.curves]).dropna(subset="success")
-    of_gas = runs.symmetry == "gas"
-    runs["K"] = [
-        curves.config["partitions"] if mapped else 1 for curves, mapped in zip(runs.curves, of_gas, strict=True)
-    ]
-    runs["real"] = -(-runs.num_demos // runs.K)
-    over_K = runs[of_gas]
-    over_n = runs[(runs.variant == "") & (runs.total_env_steps == runs.total_env_steps.mode().max())]
+    runs = runs[runs.finished & (runs.total_env_steps == runs.total_env_steps.mode().max())]
+    runs = runs.assign(success=[curves.success for curves in runs.curves], real=runs.recorded,
+                       K=[curves.config["partitions"] for curves in runs.curves]).dropna(subset="success")  # fmt: skip
+    over_K, over_n = runs[runs.symmetry == "gas"], runs[runs.variant == ""]
     if over_n.real.nunique() < 2:
         return None
     lines = {"real": dict(list(over_n.groupby("symmetry"))), "K": {}}

@@ -43,6 +43,7 @@ NUMBERS = {"training": {"p2p": "Table 4", "p2po": "Table 5", "pnp": "Table 3"},
            "test": {"p2p": "Table 6", "p2po": "Table 7", "pnp": "Table 8"}}  # fmt: skip
 METRICS = {"training": {"R10": 2, "R90": 2, "I_R": 2, "T50": 0},  # and the decimals that the paper prints
            "test": {"P_scs_percent": 1, "T_eff": 1, "R_test": 2, "E_95_cm": 2}}  # fmt: skip
+OWN_SYMMETRY = {"paper": "gas", "robust": "mirror"}  # of the recipes
 RANKED = {"training": "R90", "test": "P_scs_percent"}  # the metric by which columns are compared
 COMPARED = {"ablations": "variant", "symmetries": "symmetry"}  # tables of groups that differ in this alone
 GROUP = ["algo", "recipe", "symmetry", "variant", "total_env_steps"]
@@ -125,8 +126,10 @@ class Curves:
                 raise ValueError(f"task {c['task']}")
             names = ("task", "algo", "recipe", "symmetry", "variant", "num_demos", "seed")
             self.row = {name: c[name] for name in names} | {"lambda_bc": float(c["lambda_bc"])}
+            images = c["partitions"] if c["symmetry"] == "gas" else 1  # of each recorded demonstration
+            self.row["recorded"] = math.ceil(c["num_demos"] / images)
             self.row["total_env_steps"] = int(c["epochs"] * c["steps_per_epoch"])
-            self.row["commit"] = str(c["versions"].get("git_commit", "unknown"))
+            self.row["commit"] = str(dict(c["versions"]).get("git_commit", "unknown"))
 
     @cached_property
     def episodes(self):
@@ -169,7 +172,7 @@ def find_runs(named=None):
     remarks to print). Of one configuration and seed there is one run: the finished, longest, own one."""
     rows, remarks = {}, []
     for folder in named or (RESULTS, *RUNS):
-        found = sorted(folder.resolve().rglob("config.json"))
+        found = sorted(path for path in folder.resolve().rglob("config.json") if not path.parent.name.startswith("."))
         if named and not found:
             raise BadInput(f"--runs {folder}: no run there; a folder that holds config.json, or such folders, expected")
         for path in found:
@@ -180,7 +183,7 @@ def find_runs(named=None):
             steps = int(curves.progress.env_steps.iloc[-1:].sum()) if not curves.pid else 0
             rows[path] = curves.row | {"steps": steps, "finished": steps >= curves.row["total_env_steps"],
                                        "own": not path.is_relative_to(RESULTS.resolve()), "curves": curves}  # fmt: skip
-    names = ["task", *GROUP, *COLUMN[1:], "seed", "commit", "steps", "finished", "own", "curves"]
+    names = ["task", *GROUP, *COLUMN[1:], "recorded", "seed", "commit", "steps", "finished", "own", "curves"]
     runs = pd.DataFrame(rows.values(), columns=names).astype({"finished": bool, "own": bool})
     runs = runs.sort_values(["finished", "steps", "own"], ascending=False, kind="stable")
     for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
@@ -195,8 +198,9 @@ def find_runs(named=None):
 
 
 def of_task(runs, task, variants=False):
-    """The runs of a task; of the recipes alone unless `variants`."""
-    return runs[(runs.task == task) & (variants | (runs.variant == ""))]
+    """The runs of a task; of the recipes alone, each with its own symmetry, unless `variants`."""
+    own = (runs.variant == "") & (runs.symmetry == runs.recipe.map(OWN_SYMMETRY).fillna(runs.symmetry))
+    return runs[(runs.task == task) & (variants | own)]
 
 
 def columns(task, runs=None):
@@ -284,12 +288,12 @@ def table(kind, task, runs):
                     if kind == "test" and len(seeds) == 1 and what != BEST:
                         trials = seeds[0][0].curves.evaluations[what]
                         (low, high), method = evaluate.over_trials(trials)[metric], "over trials"
-                    paper = getattr(column, metric) if what == "" else math.nan
+                    paper = getattr(column, metric)
                     rows.append(of_group | {
                         "metric": metric, "paper": paper, "mean": mean, "low": low, "high": high,
                         "interval": method if low == low else "", "na_seeds": int(np.isnan(values).sum()),
                         # as printed, so that the mark agrees with what the reader sees
-                        "paper_outside": int(paper < round(low, digits) or paper > round(high, digits)),
+                        "paper_outside": int((paper < round(low, digits) or paper > round(high, digits)) and not what),
                         "values": values})  # fmt: skip
         if len(rows) == begun and column.sweep != "other" and (column.sweep != "pid" or kind == "test"):
             none = dict.fromkeys(GROUP[1:], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
@@ -318,7 +322,7 @@ def table_lines(kind, rows):
     digits, by = METRICS[kind], [*GROUP, "evaluation", "seeds", "unfinished"]
     lines = [["sweep", "N_demos", "lambda_BC", "", *digits, "seeds"]]
     for (sweep, _, N, lam), column in rows.groupby(["sweep", *COLUMN], sort=False):
-        paper = column[column.evaluation == ""].drop_duplicates("metric").set_index("metric").paper
+        paper = column.drop_duplicates("metric").set_index("metric").paper
         printed = ["N/A" if x != x else f"{x:.{digits[m]}f}" for m, x in paper.items()]
         key = [sweep, "", ""] if sweep == "pid" else [sweep, f"{N}", f"{lam:g}"]
         lines.append([*key, "paper", *printed, ""] if paper.notna().any() else
@@ -330,8 +334,10 @@ def table_lines(kind, rows):
             texts = []
             for cell in cells.itertuples():
                 text = between(cell.mean, cell.low, cell.high, digits[cell.metric]) + " *" * int(cell.paper_outside)
-                if cell.metric == "T50" and cell.na_seeds:
+                if cell.na_seeds and what != BEST:
                     text = "N/A" if cell.na_seeds == seeds else f"{text} ({cell.na_seeds:.0f} N/A)"
+                if cell.metric == "T50" and cell.mean == WINDOW:  # the least that the rule can give
+                    text = f"<= {WINDOW}"
                 texts.append(text)
             lines.append(["", "", "", group_label(group) + f", {what}" * bool(what), *texts,
                           f"{seeds}" + f" ({unfinished} unfinished)" * bool(unfinished)])  # fmt: skip
@@ -354,50 +360,55 @@ def table_notes(kind, rows):
 
 def undecided(kind, rows):
     """Lines: the pairs of columns, of one sweep or with the baseline, that the paper ranks by the table's main metric
-    and whose difference in our seeds has an interval that contains 0."""
-    metric, lines, single = RANKED[kind], {}, set()
+    and that our seeds rank the other way, or cannot tell apart."""
+    metric, found = RANKED[kind], {"rank the other way": {}, "cannot tell apart": {}, "agree on": {}, "too few": {}}
     for _, group in rows[(rows.metric == metric) & (rows.evaluation == "")].groupby(GROUP):
         for one, other in combinations(group.itertuples(), 2):
             compared = one.sweep == other.sweep or "baseline" in (one.sweep, other.sweep)
             if not (compared and abs(one.paper - other.paper) > 0):  # not where either is NaN
                 continue
             gap, low, high = evaluate.difference(one.values, other.values)
+            verdict = ("too few" if low != low else "cannot tell apart" if low <= 0 <= high else
+                       "agree on" if (gap > 0) == (one.paper > other.paper) else "rank the other way")  # fmt: skip
             pair = " and ".join(f"N_demos={row.num_demos} lambda_BC={row.lambda_bc:g}" for row in (one, other))
             label = group_label([getattr(one, name) for name in GROUP])
-            if low != low:
-                single.add((label, pair))
-            elif low <= 0 <= high:
-                lines[f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
-                      f"{between(gap, low, high, METRICS[kind][metric])} ({label})"] = None  # fmt: skip
-    head = f"Pairs that the paper's {metric} ranks and our seeds cannot tell apart (Welch's 95 % interval contains 0):"
-    untold = [f"  {len(single)} pair(s) not compared: a single seed"] * bool(single)
-    return [head, *(lines or ["  none"]), *untold]
+            found[verdict][f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
+                           f"{between(gap, low, high, METRICS[kind][metric])} ({label})"] = None  # fmt: skip
+    head = f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference:"
+    counts = ", ".join(f"{len(pairs)} we {verdict}" for verdict, pairs in list(found.items())[:3])
+    return [f"{head} {counts}" + f"; {len(found['too few'])} of a single seed" * bool(found["too few"]),
+            *found["rank the other way"], *found["cannot tell apart"]]  # fmt: skip
 
 
 def compared_lines(by, runs):
     """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: success in the test study, and of all
-    own episodes while training, each with Welch's difference from the recipe or from no symmetry, at as many steps or
-    else at its most."""
-    runs, order = runs[(runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))], ("", "none", "gas", "so2")
-    base, alike = {"variant": "", "symmetry": "none"}[by], [n for n in GROUP[:-1] if n != by]
-    lines = [["group", "N_demos", "lambda_BC", by, "success in the test study, by seed (%)", "mean", "difference",
-              "success while training (%)", "difference"]]  # fmt: skip
-    for (*group, N, lam), members in runs.groupby([*alike, *COLUMN[1:]]):
-        found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1]])}
-        if len({value for value, _ in found}) == 1 and (by == "symmetry" or "" in members.variant.values):
+    own episodes while training, each with Welch's difference from the recipe or from no symmetry. Symmetries are
+    compared at as many recorded demonstrations. Where the recipe has no runs of a variant's length, the test success of
+    its longest is the reference."""
+    runs = runs[runs.finished & (runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))]
+    base, order = {"variant": "", "symmetry": "none"}[by], ("", "none", "gas", "so2")
+    alike = [*(name for name in GROUP[:-1] if name != by), "lambda_bc", {"variant": "num_demos"}.get(by, "recorded")]
+    lines = [["group", "lambda_BC", by, "recorded", "N_demos", "success in the test study, by seed (%)", "mean",
+              "difference", "success while training (%)", "difference"]]  # fmt: skip
+    for (*group, lam, _), members in runs.groupby(alike):
+        found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1], "num_demos", "recorded"])}
+        if len({value for value, *_ in found}) == 1 and (by == "symmetry" or "" in members.variant.values):
             continue  # nothing to compare
-        bases = {steps: part for (value, steps), part in found.items() if value == base}
+        bases = {steps: part for (value, steps, *_), part in found.items() if value == base}
         rank = {value: i for i, value in enumerate(order)}
-        for (value, steps), part in sorted(found.items(), key=lambda item: (rank.get(item[0][0], 9), item[0])):
-            reference = bases.get(steps, bases.get(max(bases, default=0), ())) if value != base else ()
+        for (value, steps, N, recorded), part in sorted(
+            found.items(), key=lambda item: (rank.get(item[0][0], 9), item[0])
+        ):
+            same = bases.get(steps, ()) if value != base else ()
+            longest = bases.get(max(bases, default=0), ()) if value != base else ()
             cells = []
-            for name in ("success", "own_success"):
+            for name, reference in (("success", same or longest), ("own_success", same)):
                 values, others = ([getattr(curves, name) for curves in side] for side in (part, reference))
                 cells += [between(*over_seeds("P_scs_percent", values), 1),
                           between(*evaluate.difference(values, others), 1)]  # fmt: skip
             by_seed = " ".join("-" if (x := curves.success) != x else f"{x:.1f}" for curves in part)
-            lines.append([" ".join(filter(None, group)), f"{N}", f"{lam:g}",
-                          group_label([value or "the recipe's", steps]), by_seed, *cells])  # fmt: skip
+            lines.append([" ".join(filter(None, group)), f"{lam:g}", group_label([value or "the recipe's", steps]),
+                          f"{recorded}", f"{N}", by_seed, *cells])  # fmt: skip
     return lines
 
 
@@ -431,11 +442,14 @@ def markdown(lines):
 
 
 def main_group(task, runs, recipe=None):
-    """The runs of the group (of this recipe) with most runs, of the paper's columns where it can be."""
+    """The runs of the group (of this recipe) with its recipe's own symmetry and most runs, of the paper's columns where
+    it can be."""
     runs = runs[(runs.task == task) & (runs.algo != "pid") & ((runs.recipe == recipe) | (recipe is None))]
     printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
-    sizes = (printed if len(printed) else runs).groupby(GROUP).size().sort_values(kind="stable")
-    return runs[(runs[GROUP] == list(sizes.index[-1])).all(axis=1)] if len(sizes) else runs
+    groups = (printed if len(printed) else runs).groupby(GROUP).size().reset_index(name="size")
+    groups["own"] = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)
+    groups = groups.sort_values(["own", "size"], kind="stable")[GROUP]
+    return runs[(runs[GROUP] == list(groups.iloc[-1])).all(axis=1)] if len(groups) else runs
 
 
 def gaps(task, runs):

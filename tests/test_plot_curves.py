@@ -21,7 +21,7 @@ import tables
 from logx import BadInput
 from plot_curves import Flags, main
 
-CONFIG = {"task": "p2p", "algo": "ddpg", "recipe": "robust", "num_demos": 100, "lambda_bc": 1.8, "symmetry": "so2",
+CONFIG = {"task": "p2p", "algo": "ddpg", "recipe": "robust", "num_demos": 100, "lambda_bc": 1.8, "symmetry": "mirror",
           "seed": 0, "epochs": 2, "steps_per_epoch": 2000, "max_ep_len": 400, "gains": "fast",
           "partitions": 4}  # fmt: skip
 COMMIT = "0123456789" * 4
@@ -35,6 +35,7 @@ def folders(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(tables, "RUNS", (tmp_path / "runs",))
     monkeypatch.setattr(plot_curves, "FIGURES", tmp_path / "figures")
+    monkeypatch.setattr(publish, "TRIALS", 2)
     monkeypatch.setattr(publish, "PAGES", (tmp_path / "README.md", tmp_path / "results/README.md"))
 
 
@@ -187,7 +188,7 @@ def test_runs_of_different_commits_are_one_group_and_its_commits_are_printed(tmp
     write_run(tmp_path / "runs/a")
     write_run(tmp_path / "runs/b", seed=1, versions={"git_commit": "f" * 40})
     text, _, rows = tables.make_table("training", "p2p", tables.find_runs()[0])
-    assert "Commits of ddpg robust so2 4k steps: 0123456, fffffff" in text and rows.seeds.max() == 2
+    assert "Commits of ddpg robust mirror 4k steps: 0123456, fffffff" in text and rows.seeds.max() == 2
 
 
 def test_other_studies_and_the_best_evaluation_in_training_are_rows_of_their_own(tmp_path):
@@ -197,7 +198,7 @@ def test_other_studies_and_the_best_evaluation_in_training_are_rows_of_their_own
     assert cell(rows, "P_scs_percent")["mean"] == 100
     other = cell(rows, "P_scs_percent", evaluation="start -0.785 0.52 0.42, horizon 600")
     best = cell(rows, "P_scs_percent", evaluation="best evaluation in training")
-    assert (other["mean"], best["mean"]) == (50, 75) and math.isnan(other["paper"]) and math.isnan(best["paper"])
+    assert (other["mean"], best["mean"]) == (50, 75) and other["paper_outside"] == best["paper_outside"] == 0
 
 
 def test_the_PID_stands_beside_the_papers_in_the_test_and_not_in_training(tmp_path):
@@ -213,9 +214,17 @@ def test_pairs_that_the_paper_ranks_are_listed_where_the_difference_may_be_0(tmp
             write_run(tmp_path / f"runs/{lam}-{seed}", [value] * 60, lambda_bc=lam, seed=seed)
     write_run(tmp_path / "runs/one", [0.0] * 60, num_demos=0, lambda_bc=0)
     text = tables.make_table("training", "p2p", tables.find_runs()[0])[0]
-    (line,) = [line for line in text.splitlines() if "our difference" in line]
+    (line,) = [line for line in text.splitlines() if ", our difference" in line]
     assert "lambda_BC=0.1 and N_demos=100 lambda_BC=0.6: the paper's 3.72 and 6.83, our difference -1.00 [" in line
-    assert "3 pair(s) not compared" in text
+    assert "0 we rank the other way, 1 we cannot tell apart, 2 we agree on; 3 of a single seed" in text
+
+
+def test_pairs_that_our_seeds_rank_the_other_way_are_listed(tmp_path):
+    for lam, *values in ((0.1, 8, 9), (0.6, 1, 2)):
+        for seed, value in enumerate(values):
+            write_run(tmp_path / f"runs/{lam}-{seed}", [value] * 60, lambda_bc=lam, seed=seed)
+    text = tables.make_table("training", "p2p", tables.find_runs()[0])[0]
+    assert "1 we rank the other way" in text and "the paper's 3.72 and 6.83, our difference 7.00 [" in text
 
 
 def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers_tables(tmp_path):
@@ -226,19 +235,34 @@ def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers
     runs, _ = tables.find_runs()
     lines = tables.compared_lines("variant", runs)
     same, half = "100.0 [100.0, 100.0]", ["50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]
-    assert [line[3:] for line in lines[1:]] == [
+    assert [[line[2], *line[5:]] for line in lines[1:]] == [
         ["the recipe's 4k steps", "100.0 100.0", same, "-", same, "-"],
         ["n_step=1 4k steps", "50.0 50.0", *half, *half],
-        ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "0.0 [-]", "-100.0 [-]"]]  # fmt: skip
+        ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "0.0 [-]", "-"]]  # fmt: skip
     assert table("test").seeds.max() == 2 and "n_step" not in tables.make_table("test", "p2p", runs)[0]
 
 
-def test_symmetries_are_compared_with_none(tmp_path):
-    for symmetry, success in (("none", (0, 0)), ("gas", (1, 0)), ("canonical", (1, 1))):
-        write_run(tmp_path / f"runs/{symmetry}", symmetry=symmetry, success=success)
+def test_symmetries_are_compared_with_none_at_as_many_recorded_demonstrations(tmp_path):
+    for symmetry, N, success in (
+        ("none", 5, (0, 0)),
+        ("gas", 20, (1, 0)),
+        ("canonical", 5, (1, 1)),
+        ("so2", 20, (1, 1)),
+    ):
+        write_run(tmp_path / f"runs/{symmetry}", symmetry=symmetry, num_demos=N, success=success)
     lines = tables.compared_lines("symmetry", tables.find_runs()[0])[1:]
-    assert [(line[3].split()[0], line[6]) for line in lines] == [
-        ("none", "-"), ("gas", "50.0 [-]"), ("canonical", "100.0 [-]")]  # fmt: skip
+    assert [[line[2].split()[0], *line[3:5], line[7]] for line in lines] == [
+        ["none", "5", "5", "-"], ["gas", "5", "20", "50.0 [-]"], ["canonical", "5", "5", "100.0 [-]"]]  # fmt: skip
+
+
+def test_mapped_demonstrations_may_be_a_margin_worse_than_as_many_recorded_ones(tmp_path):
+    for seed in (0, 1):
+        for symmetry, N, success in (("none", 5, (0, 0)), ("none", 20, (1, 1)), ("gas", 20, (1, 1))):
+            write_run(
+                tmp_path / f"runs/{symmetry}{N}-{seed}", symmetry=symmetry, num_demos=N, success=success, seed=seed
+            )
+    found = [line[3:] for line in publish.findings_lines(tables.find_runs()[0]) if line[0].startswith("Symmetric")]
+    assert found == [["100.0 [100.0, 100.0]", "2 and 2", "*holds*"], ["0.0 [0.0, 0.0]", "2 and 2", "*holds*"]]
 
 
 @pytest.mark.parametrize("ours, verdict", [
@@ -319,7 +343,7 @@ def legend(ax):
 def test_the_learning_figure_draws_one_group_with_baseline_and_own_columns_and_the_papers_R90(tmp_path):
     for i, (N, lam) in enumerate([(100, 0.1), (80, 1), (0, 0), (300, 7)]):
         write_run(tmp_path / f"runs/{i}", [i + 1.0] * 60, num_demos=N, lambda_bc=lam)
-    write_run(tmp_path / "runs/gas", symmetry="gas")
+    write_run(tmp_path / "runs/short", epochs=1)
     drawn = figure("learning")
     both = ["DDPG (1 seed)", r"$N_{demos}=300$, $\lambda_{BC}=7$ (1 seed)", r"the paper's $\overline{R}_{90}$"]
     first, second = (legend(ax) for ax in drawn.axes)
@@ -327,12 +351,12 @@ def test_the_learning_figure_draws_one_group_with_baseline_and_own_columns_and_t
     dotted = [[line.get_ydata() for line in ax.lines if line.get_linestyle() == ":"] for ax in drawn.axes]
     assert [[values[0] for values in lines[:2]] for lines in dotted] == [[3.72, 0.9], [8.58, 0.9]]
     said = drawn.get_supxlabel().replace("\n", " ")
-    assert r"No runs yet: $\lambda_{BC}=0.6$" in said and "Not drawn: ddpg robust gas 4k steps" in said
+    assert r"No runs yet: $\lambda_{BC}=0.6$" in said and "Not drawn: ddpg robust mirror 2k steps" in said
 
 
 def test_a_sweep_without_runs_has_no_panel_and_recipe_picks_another_group(tmp_path):
     write_run(tmp_path / "runs/a")
-    write_run(tmp_path / "runs/b", num_demos=80, lambda_bc=1, recipe="paper")
+    write_run(tmp_path / "runs/b", num_demos=80, lambda_bc=1, recipe="paper", symmetry="gas")
     assert [ax.get_title() for ax in figure("learning", recipe="robust").axes] == [
         r"effect of $\lambda_{BC}$ at $N_{demos}=100$"]  # fmt: skip
     assert [ax.get_title() for ax in figure("learning", recipe="paper").axes] == [
@@ -350,12 +374,13 @@ def test_a_curve_is_the_mean_over_all_seeds_up_to_the_shortest_with_a_band_then_
 
 
 def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstrations_and_other_algorithms(tmp_path):
-    for i, config in enumerate(({}, {"seed": 1}, {"num_demos": 0, "lambda_bc": 0}, {"algo": "sac", "recipe": "sb3",
-                                "num_demos": 0, "lambda_bc": 0}, {"lambda_bc": 0.6}, {"epochs": 1})):  # fmt: skip
+    plain = {"num_demos": 0, "lambda_bc": 0}
+    sac = plain | {"algo": "sac", "recipe": "sb3", "symmetry": "none"}
+    for i, config in enumerate(({}, {"seed": 1}, plain, sac, {"lambda_bc": 0.6}, {"epochs": 1})):
         write_run(tmp_path / f"runs/{i}", **config)
     (ax,) = figure("success").axes
-    assert sorted(legend(ax)) == ["SAC sb3 so2, $N_{demos}=0$ (1 seed)", "robust so2 (2 seeds)",
-                                  "robust so2, $N_{demos}=0$ (1 seed)"]  # fmt: skip
+    assert sorted(legend(ax)) == ["SAC sb3 none, $N_{demos}=0$ (1 seed)", "robust mirror (2 seeds)",
+                                  "robust mirror, $N_{demos}=0$ (1 seed)"]  # fmt: skip
     assert all(line.get_xydata().tolist() == [[2000, 50]] for line in ax.lines)
     assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 4
 
