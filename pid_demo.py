@@ -10,7 +10,7 @@
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's
 normalised units. Gains: `authors` is the slow controller as seen of the authors
-(about 280 steps a demonstration of P2P), `fast` takes under half of them.
+(about 280 steps a demonstration of P2P), `fast` takes some half of them.
 """
 
 import dataclasses

@@ -19,6 +19,7 @@ import pandas as pd
 
 import evaluate
 import logx
+import pid_demo
 import tables
 from kinova_env import TASKS
 from logx import BadInput
@@ -104,8 +105,8 @@ def files_of_run(folder):
 
 
 def publish(sources):
-    """Copies run folders and demonstration files into data/results, keeps the weights of the best run of each task and
-    recipe, and writes index.csv. Returns remarks."""
+    """Copies run folders and demonstration files into data/results, keeps the weights of the best run of each task,
+    algorithm and recipe, and writes index.csv. Returns remarks."""
     results, found = tables.RESULTS, {}
     for path in sources:  # all of them are read before anything is written
         if path.suffix == ".npz":
@@ -137,7 +138,7 @@ def publish(sources):
                 "P_scs_percent": success, "git_commit": run["commit"]})  # fmt: skip
             if (path.parent / "policy.pt").exists():
                 rank = run["variant"] != "", -np.nan_to_num(success, nan=-1), -run["steps"], path.parent.name
-                best.setdefault((run["task"], run["recipe"]), []).append(rank)
+                best.setdefault((run["task"], run["algo"], run["recipe"]), []).append(rank)
     for *_, name in (rank for ranks in best.values() for rank in sorted(ranks)[1:]):
         (results / name / "policy.pt").unlink()
     write(results / "index.csv", pd.DataFrame(rows, columns=INDEX_COLUMNS).to_csv(index=False, float_format="%g"))
@@ -212,7 +213,8 @@ def findings_lines(runs):
 
 def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
-    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "command", "minutes"]]
+    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "steps: demonstrated + own",
+              "command", "minutes"]]  # fmt: skip
     for task in TASKS:
         printed, best = columns(task), best_column(task)
         (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
@@ -224,17 +226,21 @@ def results_lines(runs):
                        (f"{algo.upper()}, {name}", plain._replace(algo=algo), group,
                         f"{command} --num_demos 0 --lambda_bc 0")]  # fmt: skip
         agents += [(f"PID, {gains} gains", pid, of_task[of_task.recipe == gains],
-                    f"evaluate.py --pid --task {task} --gains {gains}") for gains in ("authors", "fast")]  # fmt: skip
+                    f"evaluate.py --pid --task {task} --gains {gains}") for gains in pid_demo.GAINS]  # fmt: skip
         for name, column, group, command in agents:
             part = of_column(group, column)
             rows = tables.table("test", task, part)
             found = rows[(rows.metric == "P_scs_percent") & (rows.evaluation == "") & (rows.seeds > 0)]
-            minutes = [run.progress.seconds.max() / 60 for run in part.curves if not run.pid]
+            trained = [run.progress for run in part.curves if not run.pid]
+            steps, demo_steps, seconds = ([table[name].max() for table in trained]
+                                          for name in ("env_steps", "demo_env_steps", "seconds"))  # fmt: skip
             for row in found.iloc[:1].to_dict("records"):
-                lines.append([TITLES[task], name, "-" if row["paper"] != row["paper"] else f"{row['paper']:g}",
+                printed = row["paper"] if row["recipe"] != "fast" else math.nan  # the paper has one controller
+                lines.append([TITLES[task], name, "-" if printed != printed else f"{printed:g}",
                               between(row["mean"], row["low"], row["high"], 1),
-                              f"{row['seeds']}" + " (unfinished)" * bool(row["unfinished"]), f"`{command}`",
-                              f"{np.median(minutes):.0f}" if minutes else "-"])  # fmt: skip
+                              f"{row['seeds']}" + " (unfinished)" * bool(row["unfinished"]) if trained else "-",
+                              f"{np.mean(demo_steps) / 1000:.0f}k + {np.mean(steps) / 1000:.0f}k" if trained else "-",
+                              f"`{command}`", f"{np.median(seconds) / 60:.0f}" if trained else "-"])  # fmt: skip
     return lines
 
 

@@ -66,7 +66,7 @@ class Flags:
     # what to do
     jobs: int | None = flag(None, "runs at a time; 1 here, 256 on Slurm", low=1)
     nice: int = flag(0, "lower priority of the runs on this machine", low=0, high=19)
-    dry_run: bool = flag(False, "print the commands and what they cost, and do nothing")
+    dry_run: bool = flag(False, "print the commands and what they cost, measured by short runs, and train nothing")
     status: bool = flag(False, "print how far each run in data_dir is, and do nothing")
     # on a cluster
     cluster: str | None = flag(None, "submit the runs instead of running them here", ("slurm",))

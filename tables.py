@@ -48,7 +48,7 @@ RANKED = {"training": "R90", "test": "P_scs_percent"}  # the metric by which col
 COMPARED = {"ablations": "variant", "symmetries": "symmetry"}  # tables of groups that differ in this alone
 GROUP = ["algo", "recipe", "symmetry", "variant", "total_env_steps"]
 COLUMN = ["algo", "num_demos", "lambda_bc"]  # what the paper varies
-BEST = "best evaluation in training"
+BEST, LATE = "best evaluation in training", "mean of the last fifth of evaluations in training"
 WINDOW = 50  # episodes of the running mean, in T50 and in the figures
 
 
@@ -155,6 +155,11 @@ class Curves:
         return evaluate.metrics(self.evaluations[""])["P_scs_percent"] if "" in self.evaluations else math.nan
 
     @property
+    def trial_steps(self):
+        """Mean steps of the test study's successful trials; NaN where there are none."""
+        return evaluate.metrics(self.evaluations[""])["steps"] if "" in self.evaluations else math.nan
+
+    @property
     def own_success(self):
         """Percent of the own episodes while training that succeeded, exploration and all."""
         return 100 * self.episodes.success.mean()
@@ -259,7 +264,7 @@ def over_seeds(metric, values):
 
 
 def measured(kind, runs):
-    """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies, the best in training."""
+    """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies, BEST and LATE."""
     found = {}
     for run in runs.itertuples():
         if kind == "training" and not run.curves.pid:
@@ -267,8 +272,10 @@ def measured(kind, runs):
         for what, trials in run.curves.evaluations.items() if kind == "test" else ():
             found.setdefault(what, []).append((run, evaluate.metrics(trials)))
         if kind == "test" and len(run.curves.validation):
-            found.setdefault(BEST, []).append((run, {"P_scs_percent": run.curves.validation.max()}))
-    return dict(sorted(found.items(), key=lambda item: (item[0] == BEST, item[0])))
+            values = run.curves.validation
+            for what, value in ((BEST, values.max()), (LATE, values[-math.ceil(len(values) / 5) :].mean())):
+                found.setdefault(what, []).append((run, {"P_scs_percent": value}))
+    return dict(sorted(found.items(), key=lambda item: (item[0] in (BEST, LATE), item[0])))
 
 
 def table(kind, task, runs):
@@ -285,7 +292,7 @@ def table(kind, task, runs):
                 for metric, digits in METRICS[kind].items():
                     values = np.array([metrics.get(metric, math.nan) for _, metrics in seeds])
                     (mean, low, high), method = over_seeds(metric, values), "over seeds"
-                    if kind == "test" and len(seeds) == 1 and what != BEST:
+                    if kind == "test" and len(seeds) == 1 and what not in (BEST, LATE):
                         trials = seeds[0][0].curves.evaluations[what]
                         (low, high), method = evaluate.over_trials(trials)[metric], "over trials"
                     paper = getattr(column, metric)
@@ -334,7 +341,7 @@ def table_lines(kind, rows):
             texts = []
             for cell in cells.itertuples():
                 text = between(cell.mean, cell.low, cell.high, digits[cell.metric]) + " *" * int(cell.paper_outside)
-                if cell.na_seeds and what != BEST:
+                if cell.na_seeds and what not in (BEST, LATE):
                     text = "N/A" if cell.na_seeds == seeds else f"{text} ({cell.na_seeds:.0f} N/A)"
                 if cell.metric == "T50" and cell.mean == WINDOW:  # the least that the rule can give
                     text = f"<= {WINDOW}"
@@ -351,7 +358,7 @@ def table_notes(kind, rows):
         notes += ["[-]: a single seed has none. T50 is by our rule (N/A where R90 <= 0); the paper's cannot be."]
     else:
         notes += ["A single seed: its interval over trials (P_scs: Wilson's), which knows nothing of other seeds.",
-                  f"The {BEST} is the best policy's on its trials there, not the last policy's."]  # fmt: skip
+                  "Evaluations in training: 50 validation trials each; the best is not the last policy's."]  # fmt: skip
     ours = rows[(rows.seeds > 0) & (rows.algo != "pid")]
     for group, texts in ours.groupby(GROUP, sort=False).commits:
         notes.append(f"Commits of {group_label(group)}: {', '.join(sorted(set(' '.join(texts).split())))}")
@@ -381,15 +388,15 @@ def undecided(kind, rows):
 
 
 def compared_lines(by, runs):
-    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: success in the test study, and of all
-    own episodes while training, each with Welch's difference from the recipe or from no symmetry. Symmetries are
-    compared at as many recorded demonstrations. Where the recipe has no runs of a variant's length, the test success of
-    its longest is the reference."""
+    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: success in the test study, the steps
+    that its successful trials take, success of all own episodes while training, each with Welch's difference from the
+    recipe or from no symmetry. Symmetries are compared at as many recorded demonstrations. Where the recipe has no runs
+    of a variant's length, the test study of its longest is the reference."""
     runs = runs[runs.finished & (runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))]
     base, order = {"variant": "", "symmetry": "none"}[by], ("", "none", "gas", "so2")
     alike = [*(name for name in GROUP[:-1] if name != by), "lambda_bc", {"variant": "num_demos"}.get(by, "recorded")]
     lines = [["group", "lambda_BC", by, "recorded", "N_demos", "success in the test study, by seed (%)", "mean",
-              "difference", "success while training (%)", "difference"]]  # fmt: skip
+              "difference", "steps", "difference", "success while training (%)", "difference"]]  # fmt: skip
     for (*group, lam, _), members in runs.groupby(alike):
         found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1], "num_demos", "recorded"])}
         if len({value for value, *_ in found}) == 1 and (by == "symmetry" or "" in members.variant.values):
@@ -402,10 +409,15 @@ def compared_lines(by, runs):
             same = bases.get(steps, ()) if value != base else ()
             longest = bases.get(max(bases, default=0), ()) if value != base else ()
             cells = []
-            for name, reference in (("success", same or longest), ("own_success", same)):
+            for name, digits, reference in (
+                ("success", 1, same or longest),
+                ("trial_steps", 0, same or longest),
+                ("own_success", 1, same),
+            ):
                 values, others = ([getattr(curves, name) for curves in side] for side in (part, reference))
-                cells += [between(*over_seeds("P_scs_percent", values), 1),
-                          between(*evaluate.difference(values, others), 1)]  # fmt: skip
+                metric = "" if name == "trial_steps" else "P_scs_percent"
+                cells += [between(*over_seeds(metric, values), digits),
+                          between(*evaluate.difference(values, others), digits)]  # fmt: skip
             by_seed = " ".join("-" if (x := curves.success) != x else f"{x:.1f}" for curves in part)
             lines.append([" ".join(filter(None, group)), f"{lam:g}", group_label([value or "the recipe's", steps]),
                           f"{recorded}", f"{N}", by_seed, *cells])  # fmt: skip

@@ -236,9 +236,9 @@ def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers
     lines = tables.compared_lines("variant", runs)
     same, half = "100.0 [100.0, 100.0]", ["50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]
     assert [[line[2], *line[5:]] for line in lines[1:]] == [
-        ["the recipe's 4k steps", "100.0 100.0", same, "-", same, "-"],
-        ["n_step=1 4k steps", "50.0 50.0", *half, *half],
-        ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "0.0 [-]", "-"]]  # fmt: skip
+        ["the recipe's 4k steps", "100.0 100.0", same, "-", "4 [4, 4]", "-", same, "-"],
+        ["n_step=1 4k steps", "50.0 50.0", *half, "3 [3, 3]", "-0 [-0, -0]", *half],
+        ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "-", "-", "0.0 [-]", "-"]]  # fmt: skip
     assert table("test").seeds.max() == 2 and "n_step" not in tables.make_table("test", "p2p", runs)[0]
 
 
