@@ -182,7 +182,7 @@ def success_figure(task, runs, flags):
     """Success in the trials while training over environment steps, a line a method: of a recipe and symmetry the
     paper's best column and the one without demonstrations; of other algorithms, and where --runs names runs, all."""
     best = tables.best_column(task)
-    runs = runs[[len(curves.validation) > 0 for curves in runs.curves]]
+    runs = runs[np.array([len(curves.validation) > 0 for curves in runs.curves], bool)]
     plain, other = (runs.num_demos == 0) & (runs.lambda_bc == 0), runs.algo != best.algo
     at_best = (runs[COLUMN] == [getattr(best, name) for name in COLUMN]).all(axis=1)
     shown, lines = runs if flags.runs else runs[plain | other | at_best], {}
@@ -358,8 +358,9 @@ def demos_figure(task, runs, flags):
 
 def trajectories_figure(task, runs, flags):
     """The successful ones of the first 20 test trials of the run with the highest P_scs (Fig. 9)."""
-    tested = runs[[not c.pid and c.trajectories.exists() and c.success == c.success for c in runs.curves]]
-    best = max(tested.itertuples(), key=lambda run: run.curves.success, default=None)
+    tested = [run for run in runs.itertuples()
+              if not run.curves.pid and run.curves.trajectories.exists() and run.curves.success >= 0]  # fmt: skip
+    best = max(tested, key=lambda run: run.curves.success, default=None)
     if best is None:
         return None
     paths = [path for path in tables.read_paths(best.curves.trajectories)[1] if path["success"]]

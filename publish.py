@@ -128,7 +128,10 @@ def publish(sources):
         for name, data in reversed(files.items()):  # config.json last: without it, half a copy is no run
             write(part / name, data)
         shutil.rmtree(target, ignore_errors=True)
-        os.replace(part, target)
+        try:
+            os.replace(part, target)
+        except OSError as error:
+            raise BadInput(f"{target}: {error.strerror}; a run's folder is expected there") from None
     rows, best = [], {}
     for path in sorted(results.glob("[!.]*/config.json")):
         for run in tables.find_runs([path.parent])[0].to_dict("records"):
@@ -325,4 +328,7 @@ def report(figures):
         raise BadInput(f"--report: no run in {tables.RESULTS}; --publish puts them there")
     marked = re.compile(r"^<!-- (\S+) -->$.*?^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES if page.exists()}
+    for page, text in texts.items():
+        for name in re.findall(r"^<!-- (\S+) -->$", marked.sub("", text), re.MULTILINE):
+            raise BadInput(f"{page}: <!-- {name} --> is one mark alone; its block ends with <!-- /{name} -->")
     return {page: marked.sub(partial(block, page=page), text) for page, text in texts.items()}

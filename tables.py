@@ -147,6 +147,8 @@ class Curves:
             what = re.sub(r"^evaluation-?|\.csv(\.gz)?$", "", path.name)  # start_-0.8_0.5_0.4-horizon_600
             what = ", ".join(part.replace("_", " ") for part in re.split("-(?=[a-z])", what))
             found[what] = read_csv(path, ("trial", "success", "length", "return", "effort_percent", "e95_cm"))
+            if not len(found[what]):
+                raise BadInput(f"{path}: no trial; run evaluate.py again")
         return dict(sorted(found.items()))
 
     @property

@@ -621,6 +621,13 @@ def test_report_rewrites_the_marked_blocks_from_data_results_and_leaves_the_rest
         main(["--report"])
 
 
+def test_a_mark_without_its_other_mark_is_named(tmp_path, monkeypatch):
+    publish.publish([publishable(tmp_path / "x/a")])
+    (tmp_path / "README.md").write_text("<!-- results -->\nold\n")
+    with pytest.raises(BadInput, match="README.md: <!-- results --> is one mark alone"):
+        main(["--report"])
+
+
 def test_the_pages_hold_what_the_published_files_say(monkeypatch):
     monkeypatch.undo()  # the real folders
     for page, text in publish.report(plot_curves.published_figures()).items():
