@@ -14,8 +14,8 @@ group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
 where NAME is results, findings, watched, demonstrator, cost, figures, or
-training, test, ablations, symmetries, figures with -p2p, -p2po, -pnp. --report
-rewrites what is between them in README.md, DIFFERENCES.md and
+training, test, ablations, symmetries, partitions, figures with -p2p, -p2po,
+-pnp. --report rewrites what is between them in README.md, DIFFERENCES.md and
 data/results/README.md from data/results, and draws the figures there.
 """
 

@@ -45,7 +45,9 @@ METRICS = {"training": {"R10": 2, "R90": 2, "I_R": 2, "T50": 0},  # and the deci
            "test": {"P_scs_percent": 1, "T_eff": 1, "R_test": 2, "E_95_cm": 2}}  # fmt: skip
 OWN_SYMMETRY = {"paper": "gas", "robust": "mirror"}  # of the recipes
 RANKED = {"training": "R90", "test": "P_scs_percent"}  # the metric by which columns are compared
-COMPARED = {"ablations": "variant", "symmetries": "symmetry"}  # tables of groups that differ in this alone
+# Tables of groups that differ in one thing alone: it, what the others are compared with, and what is the same for all.
+COMPARED = {"ablations": ("variant", "", ["num_demos"]), "symmetries": ("symmetry", "none", ["recorded"]),
+            "partitions": ("K", 4, ["recorded", "num_demos"])}  # fmt: skip
 GROUP = ["algo", "recipe", "symmetry", "variant", "total_env_steps"]
 COLUMN = ["algo", "num_demos", "lambda_bc"]  # what the paper varies
 BEST, LATE = "best evaluation in training", "mean of the last fifth of evaluations in training"
@@ -126,8 +128,8 @@ class Curves:
                 raise ValueError(f"task {c['task']}")
             names = ("task", "algo", "recipe", "symmetry", "variant", "num_demos", "seed")
             self.row = {name: c[name] for name in names} | {"lambda_bc": float(c["lambda_bc"])}
-            images = c["partitions"] if c["symmetry"] == "gas" else 1  # of each recorded demonstration
-            self.row["recorded"] = math.ceil(c["num_demos"] / images)
+            self.row["K"] = c["partitions"] if c["symmetry"] == "gas" else 1  # images of a recorded demonstration
+            self.row["recorded"] = math.ceil(c["num_demos"] / self.row["K"])
             self.row["total_env_steps"] = int(c["epochs"] * c["steps_per_epoch"])
             self.row["commit"] = str(dict(c["versions"]).get("git_commit", "unknown"))
 
@@ -190,7 +192,7 @@ def find_runs(named=None):
             steps = int(curves.progress.env_steps.iloc[-1:].sum()) if not curves.pid else 0
             rows[path] = curves.row | {"steps": steps, "finished": steps >= curves.row["total_env_steps"],
                                        "own": not path.is_relative_to(RESULTS.resolve()), "curves": curves}  # fmt: skip
-    names = ["task", *GROUP, *COLUMN[1:], "recorded", "seed", "commit", "steps", "finished", "own", "curves"]
+    names = ["task", *GROUP, *COLUMN[1:], "K", "recorded", "seed", "commit", "steps", "finished", "own", "curves"]
     runs = pd.DataFrame(rows.values(), columns=names).astype({"finished": bool, "own": bool})
     runs = runs.sort_values(["finished", "steps", "own"], ascending=False, kind="stable")
     for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
@@ -389,25 +391,26 @@ def undecided(kind, rows):
             *found["rank the other way"], *found["cannot tell apart"]]  # fmt: skip
 
 
-def compared_lines(by, runs):
-    """Groups that differ in `by` (variant or symmetry) alone, as lines of cells: success in the test study, the steps
-    that its successful trials take, success of all own episodes while training, each with Welch's difference from the
-    recipe or from no symmetry. Symmetries are compared at as many recorded demonstrations. Where the recipe has no runs
-    of a variant's length, the test study of its longest is the reference."""
-    runs = runs[runs.finished & (runs.algo != "pid") & ((by == "variant") | (runs.variant == ""))]
-    base, order = {"variant": "", "symmetry": "none"}[by], ("", "none", "gas", "so2")
-    alike = [*(name for name in GROUP[:-1] if name != by), "lambda_bc", {"variant": "num_demos"}.get(by, "recorded")]
+def compared_lines(kind, runs):
+    """The table `kind` of COMPARED as lines of cells: success in the test study, the steps that its successful trials
+    take, success of all own episodes while training, each with Welch's difference. Where what a variant is compared
+    with has no runs of its length, the test study of its longest is the reference."""
+    by, base, held = COMPARED[kind]
+    own = runs.symmetry == runs.recipe.map(OWN_SYMMETRY).fillna(runs.symmetry)
+    wanted = {"variant": own, "symmetry": runs.variant == "",
+              "K": (runs.symmetry == "gas") & runs.variant.str.fullmatch(r"(partitions=\d+)?")}[by]  # fmt: skip
+    runs = runs[runs.finished & (runs.algo != "pid") & wanted]
+    alike = [name for name in GROUP[:-1] if name != by and (by, name) != ("K", "variant")]
     lines = [["group", "lambda_BC", by, "recorded", "N_demos", "success in the test study, by seed (%)", "mean",
               "difference", "steps", "difference", "success while training (%)", "difference"]]  # fmt: skip
-    for (*group, lam, _), members in runs.groupby(alike):
-        found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1], "num_demos", "recorded"])}
-        if len({value for value, *_ in found}) == 1 and (by == "symmetry" or "" in members.variant.values):
+    groups = [members for same in held for _, members in runs.groupby([*alike, "lambda_bc", same])]
+    for members in groups:
+        if members[by].nunique() == 1 and (by != "variant" or "" in members.variant.values):
             continue  # nothing to compare
+        found = {key: list(part.curves) for key, part in members.groupby([by, GROUP[-1], "recorded", "num_demos"])}
         bases = {steps: part for (value, steps, *_), part in found.items() if value == base}
-        rank = {value: i for i, value in enumerate(order)}
-        for (value, steps, N, recorded), part in sorted(
-            found.items(), key=lambda item: (rank.get(item[0][0], 9), item[0])
-        ):
+        for key in sorted(found, key=lambda key: (key[0] != base and by != "K", key)):
+            (value, steps, recorded, N), part = key, found[key]
             same = bases.get(steps, ()) if value != base else ()
             longest = bases.get(max(bases, default=0), ()) if value != base else ()
             cells = []
@@ -421,7 +424,8 @@ def compared_lines(by, runs):
                 cells += [between(*over_seeds(metric, values), digits),
                           between(*evaluate.difference(values, others), digits)]  # fmt: skip
             by_seed = " ".join("-" if (x := curves.success) != x else f"{x:.1f}" for curves in part)
-            lines.append([" ".join(filter(None, group)), f"{lam:g}", group_label([value or "the recipe's", steps]),
+            about, label = members.iloc[0], group_label([f"{value}" or "the recipe's", steps])
+            lines.append([" ".join(about[name] for name in alike if about[name]), f"{about.lambda_bc:g}", label,
                           f"{recorded}", f"{N}", by_seed, *cells])  # fmt: skip
     return lines
 
@@ -434,8 +438,9 @@ def make_table(kind, task, runs, variants=False):
         lines, notes, rows = table_lines(kind, rows), table_notes(kind, rows), rows.drop(columns="values")
         title = f"{TITLES[task]}, {kind} metrics: {NUMBERS[kind][task]}, and ours"
     else:
-        lines = compared_lines(COMPARED[kind], of_task(runs, task, variants=True))
-        notes = ["Mean over seeds, difference from the recipe or no symmetry; 95 % intervals by Student and Welch."]
+        lines = compared_lines(kind, of_task(runs, task, variants=True))
+        base = {"ablations": "the recipe", "symmetries": "no symmetry", "partitions": "K = 4"}[kind]
+        notes = [f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch."]
         notes, rows = notes + ["  no runs"] * (len(lines) == 1), pd.DataFrame(lines[1:], columns=lines[0])
         title = f"{TITLES[task]}, {kind}"
     text = "\n".join([title, "", aligned(lines), "", *notes])

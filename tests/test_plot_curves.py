@@ -233,7 +233,7 @@ def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers
         write_run(tmp_path / f"runs/b{seed}", seed=seed, success=(1, 0), own=(1, 0), variant="n_step=1")
     write_run(tmp_path / "runs/short", seed=0, success=(0, 0), epochs=1, steps=2000, variant="pi_lr=0.0")
     runs, _ = tables.find_runs()
-    lines = tables.compared_lines("variant", runs)
+    lines = tables.compared_lines("ablations", runs)
     same, half = "100.0 [100.0, 100.0]", ["50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]
     assert [[line[2], *line[5:]] for line in lines[1:]] == [
         ["the recipe's 4k steps", "100.0 100.0", same, "-", "4 [4, 4]", "-", same, "-"],
@@ -250,9 +250,20 @@ def test_symmetries_are_compared_with_none_at_as_many_recorded_demonstrations(tm
         ("so2", 20, (1, 1)),
     ):
         write_run(tmp_path / f"runs/{symmetry}", symmetry=symmetry, num_demos=N, success=success)
-    lines = tables.compared_lines("symmetry", tables.find_runs()[0])[1:]
+    lines = tables.compared_lines("symmetries", tables.find_runs()[0])[1:]
     assert [[line[2].split()[0], *line[3:5], line[7]] for line in lines] == [
-        ["none", "5", "5", "-"], ["gas", "5", "20", "50.0 [-]"], ["canonical", "5", "5", "100.0 [-]"]]  # fmt: skip
+        ["none", "5", "5", "-"], ["canonical", "5", "5", "100.0 [-]"], ["gas", "5", "20", "50.0 [-]"]]  # fmt: skip
+
+
+def test_partitions_are_compared_with_4_at_as_many_recorded_and_at_as_many_mapped_demonstrations(tmp_path):
+    for K, N, success in ((4, 20, (1, 1)), (2, 10, (1, 0)), (2, 20, (0, 0))):
+        variant = "" if K == 4 else f"partitions={K}"
+        config = {"symmetry": "gas", "partitions": K, "num_demos": N, "variant": variant}
+        write_run(tmp_path / f"runs/{K}-{N}", success=success, **config)
+    lines = tables.compared_lines("partitions", tables.find_runs()[0])[1:]
+    assert [[line[2].split()[0], *line[3:5], line[7]] for line in lines] == [
+        ["2", "5", "10", "-50.0 [-]"], ["4", "5", "20", "-"],
+        ["2", "10", "20", "-100.0 [-]"], ["4", "5", "20", "-"]]  # fmt: skip
 
 
 def test_mapped_demonstrations_may_be_a_margin_worse_than_as_many_recorded_ones(tmp_path):
