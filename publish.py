@@ -157,6 +157,7 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "mask": "The mask matters",
     "symmetry": "Symmetric demonstrations cost less",
     "PID": "The agent beats its demonstrator",
+    "quick": "The agent is quicker than its demonstrator (ours)",
 }
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 
@@ -190,25 +191,30 @@ def comparisons(task, runs):
             yield ("symmetry", f"{label}: {recorded} recorded and mapped to {N}, and {N} recorded: at most {MARGIN} "
                    "points worse", curves, none.get((N, lam)), MARGIN)  # fmt: skip
         gains = found[key][0].config["gains"] if key in found else None
-        yield "PID", f"{label}, and the PID with {gains} gains on the same goals", found.get(key), pid.get(gains), 0
+        compared = f"{label}, and the PID with {gains} gains in the same trials"
+        yield "PID", compared, found.get(key), pid.get(gains), 0
+        yield "quick", compared, found.get(key), pid.get(gains), 0
 
 
 def findings_lines(runs):
     """Each claim of the paper, the difference in our test success, and what it says: Welch's interval over seeds; with
-    the PID, which is one controller, Student's of the differences from it."""
-    lines, said = [["the paper's claim", "task", "compared", "difference, points", "seeds", ""]], {}
+    the PID, which is one controller, Student's of the differences from it in the same trials."""
+    lines, said = [["claim", "task", "compared", "difference", "seeds", ""]], {}
     found = ((task, *sides) for task in TASKS for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
-        ours, theirs = ([x for x in (c.success for c in side or ()) if x == x] for side in (one, other))
+        ours, theirs = ([curves for curves in side or () if curves.success == curves.success] for side in (one, other))
         if not (ours and theirs):
             continue
-        gap, low, high = evaluate.difference(ours, theirs)
-        if claim == "PID":
-            gap, low, high = evaluate.over_seeds(np.subtract(ours, theirs[0]))
+        gap, low, high = evaluate.difference([c.success for c in ours], [c.success for c in theirs])
+        if claim in ("PID", "quick"):
+            metric, sign = ("P_scs_percent", 1) if claim == "PID" else ("steps", -1)
+            pairs = [evaluate.paired(curves.evaluations[""], theirs[0].evaluations[""]) for curves in ours]
+            gap, low, high = evaluate.over_seeds([sign * pair[metric][0] for pair in pairs])
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
-        seeds = f"{len(ours)}" if claim == "PID" else f"{len(ours)} and {len(theirs)}"
-        said.setdefault(claim, []).append([TITLES[task], compared, between(gap, low, high, 1), seeds,
-                                           f"*{verdict if low == low else 'too few seeds'}*"])  # fmt: skip
+        seeds = f"{len(ours)}" if claim in ("PID", "quick") else f"{len(ours)} and {len(theirs)}"
+        text = between(gap, low, high, 1) + (" steps" if claim == "quick" else " points")
+        said.setdefault(claim, []).append(
+            [TITLES[task], compared, text, seeds, f"*{verdict if low == low else 'too few seeds'}*"])  # fmt: skip
     for claim, sentence in CLAIMS.items():
         lines += [[sentence, *line] for line in said.get(claim, [["", "no runs", "", "", ""]])]
     return lines
