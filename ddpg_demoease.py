@@ -48,7 +48,7 @@ class Flags(logx.RunFlags):
     )
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 1; 5 T steps an epoch is ours: the paper does not say)
-    epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 10", low=1)
+    epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 25", low=1)
     steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T, robust p2p: 1000", low=1)
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 1; start_steps and update_after: ours)
@@ -91,7 +91,7 @@ ROBUST = dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_n
               clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0, normalize_obs=False,
               grasp_input=False)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40, act_noise=0.1),
-                   pnp=dict(epochs=10, normalize_obs=True, grasp_input=True))  # fmt: skip
+                   pnp=dict(epochs=25, normalize_obs=True, grasp_input=True))  # fmt: skip
 
 
 def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
