@@ -58,10 +58,12 @@ class NotFinite(ArithmeticError):
 
 
 def run_script(main):
-    """Runs a script's main() and ends the process: 0 done, 2 bad input, 3 NaN, 130 interrupted, each with one line."""
+    """Runs a script's main() and ends the process: 0 done, 2 bad input, 3 NaN, 130 interrupted, each with one line,
+    141 where nobody reads its output."""
     code, message = 0, ""
     try:
         code = main() or 0
+        sys.stdout.flush()
     except BadInput as error:
         code, message = 2, f"error: {one_line(error)}"
     except NotFinite as error:
@@ -69,6 +71,7 @@ def run_script(main):
     except KeyboardInterrupt as interrupt:
         code, message = 130, " ".join(map(str, interrupt.args))
     except BrokenPipeError:  # the reader of our output has seen enough
+        code = 128 + signal.SIGPIPE
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if message:
         print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
@@ -153,21 +156,13 @@ def parse_flags(cls, doc, argv=None):
             options |= {"metavar": about["metavar"]} if about["metavar"] else {}
         parser.add_argument(field.name if about["positional"] else f"--{field.name}", **options)
     values, unknown = parser.parse_known_args(argv)
-    if unknown:
-        raise BadInput(
-            _no_such_flag(unknown[0], [f"--{field.name}" for field in dataclasses.fields(cls) if field.metadata])
-        )
+    if unknown:  # --batch-size and --batchsize are told --batch_size
+        name = unknown[0].split("=")[0]
+        near = difflib.get_close_matches(name, [f"--{field}" for field in vars(values)], 1)
+        raise BadInput(f"{name}: no such flag" + (f"; did you mean {near[0]}?" if near else "; --help lists them"))
     for name, value in vars(values).items():
         setattr(values, name, tuple(value) if isinstance(value, list) else value)
     return check_flags(cls(**vars(values)))
-
-
-def _no_such_flag(word, flags):
-    """--batch-size and --batchsize are told --batch_size."""
-    name = word.split("=")[0]
-    near = [f for f in flags if f == name.replace("-", "_").replace("__", "--", 1)]
-    near = near or difflib.get_close_matches(name, flags, 1)
-    return f"{name}: no such flag" + (f"; did you mean {near[0]}?" if near else "; --help lists them")
 
 
 def check_flags(flags):
@@ -180,7 +175,7 @@ def check_flags(flags):
                 raise BadInput(f"--{field.name} {x}: must be one of {', '.join(map(str, choices))}")
             if x is None or isinstance(x, (bool, str, Path)):
                 continue
-            if not math.isfinite(x) or (low is not None and x < low) or (high is not None and x > high):
+            if not abs(x) < math.inf or (low is not None and x < low) or (high is not None and x > high):
                 bounds = [f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None]
                 allowed = " and ".join(bounds) or "a finite number"
                 raise BadInput(f"--{field.name} {x}: must be {allowed}")
@@ -189,10 +184,9 @@ def check_flags(flags):
 
 BOARD = dict(eval="test", EpRet="train", EpLen="train", Success="train", L="loss", epoch="time", env="time",
              demo="time", seconds="time")  # TensorBoard's group of a column, by its first word  # fmt: skip
-# What a table's column and a run's seed say, and what does not change what is learned: all else makes a variant.
-NOT_A_VARIANT = {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed", "epochs", "name", "data_dir", "resume",
-                 "device", "eval_every", "eval_trials", "checkpoint_every", "quick", "quiet", "tensorboard",
-                 "variant"}  # fmt: skip
+FREE = {field.name for field in dataclasses.fields(RunFlags)} | {"epochs"}  # what a resumed run may have otherwise
+# With it what a table's column and a run's seed say: all else makes a variant.
+NOT_A_VARIANT = FREE | {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed"}
 
 
 def recorded(flags):
@@ -313,15 +307,15 @@ class Replayable(gymnasium.Wrapper):
         super().__init__(env)
         env.reset(seed=seed)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self):
         self._began = self.unwrapped.np_random.bit_generator.state
-        self._s, info = self.env.reset(seed=seed, options=options)
+        self._s, info = self.env.reset()
         self.episode = []
         return self._s, info
 
     def step(self, action):
         if not np.isfinite(action).all():
-            raise NotFinite("the actor gives NaN; go on from the last checkpoint with --resume, or begin anew")
+            raise NotFinite("the actor gives NaN; begin anew with smaller learning rates")
         s2, r, terminated, truncated, info = self.env.step(action)
         self.episode.append((self._s, action, r, s2, terminated, truncated))
         self._s = s2
@@ -355,7 +349,7 @@ class RunFolder:
         self.flags, self.folder = flags, Path(flags.data_dir) / flags.name
         self.total_steps = flags.epochs * flags.steps_per_epoch
         self.columns = {"episodes": EPISODES, "progress": [*PROGRESS, *measured, *EVALUATED]}
-        self._config = dataclasses.asdict(flags) | {"algo": algo, "resume": bool(flags.resume)}
+        self._config = json.loads(json.dumps(dataclasses.asdict(flags) | {"algo": algo}, default=str))
         self._files, self._board, self._bar = {}, None, None
         self.stop_signals = []
         self._log = {"episodes": 0, "epoch_episodes": [], "epoch_updates": [], "demo_env_steps": 0}
@@ -374,6 +368,8 @@ class RunFolder:
                 raise BadInput(f"{name}: {folder} is a file")
             if folder.exists() and set(os.listdir(folder)) - {"lock", "log.txt"} and not self.flags.resume:
                 raise BadInput(f"{name}: {folder} exists; go on with --resume, or choose another --name")
+            if list(folder.glob("*.csv.gz")):
+                raise BadInput(f"{name}: {folder} is a published run, without the state to go on from; begin a new one")
             self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = open(folder / "lock", "w")  # noqa: SIM115 - held until close
@@ -399,17 +395,15 @@ class RunFolder:
 
     def _same_run(self):
         """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
-        free = {"resume", "quiet", "epochs", "name", "data_dir", "tensorboard", "checkpoint_every", "eval_every",
-                "eval_trials", "device", "quick", "variant"}  # fmt: skip
         saved, path = self.checkpoint, self.folder / "checkpoint.pt"
         parts = {"format", "config", "log", "log_bytes", "seconds"}
         if not isinstance(saved, dict) or not parts <= set(saved) or saved["format"] != FORMAT:
             raise BadInput(f"{path}: of another version of this code; begin a new --name")
-        before, now = json.loads(saved["config"]), json.loads(json.dumps(self._config))
+        before, now = json.loads(saved["config"]), self._config
         if before["algo"] != now["algo"]:
             raise BadInput(f"{path}: a run of {before['algo']}, not of {now['algo']}")
         for key in sorted(set(now) | set(before)):
-            if key not in free and now.get(key) != before.get(key):
+            if key not in FREE and now.get(key) != before.get(key):
                 raise BadInput(f"{path}: made with --{key} {before.get(key)}, not {now.get(key)}")
         path = self.folder / "config.json"
         try:
@@ -449,7 +443,7 @@ class RunFolder:
         """Whether the checkpoint is of a run's end; says so."""
         done = bool(self.checkpoint) and self.checkpoint["t"] >= self.total_steps
         if done:
-            print(f"{self.folder}: finished, {self.checkpoint['t']} steps; more with --epochs, a new run with --name")
+            print(f"{self.folder}: finished, {self.checkpoint['t']} steps; more with --resume {self.folder} --epochs N")
         return done
 
     def begin(self, demo_env_steps=0):
@@ -476,7 +470,7 @@ class RunFolder:
             from torch.utils.tensorboard import SummaryWriter
             from torch.utils.tensorboard.summary import hparams
 
-            self._board = SummaryWriter(self.folder)
+            self._board = SummaryWriter(self.folder, purge_step=start + 1)
             plain = {k: v if isinstance(v, (int, float, str)) else str(v) for k, v in self._config.items()}
             for part in hparams(plain, {"test/eval_success": 0, "train/EpRet": 0}):
                 self._board.file_writer.add_summary(part)
@@ -540,8 +534,7 @@ class RunFolder:
         """Floats by name (NaN: not measured) of some updates of net; the epoch's line has their mean. Raises NotFinite
         where a weight is not finite: nothing may act with it, or overwrite a checkpoint."""
         if not all(w.isfinite().all() for w in net.parameters()):
-            raise NotFinite(f"{self.folder}: a weight is NaN or infinite; go on from its last checkpoint with "
-                            "--resume, or begin anew with smaller learning rates")  # fmt: skip
+            raise NotFinite(f"{self.folder}: a weight is NaN or infinite; begin anew with smaller learning rates")
         self._log["epoch_updates"].append(measured)
 
     def log_epoch(self, env_steps, evaluate):
@@ -595,6 +588,6 @@ class RunFolder:
                 os.fsync(file.fileno())
                 sizes[table] = os.fstat(file.fileno()).st_size
             state = state | {"log_bytes": sizes, "log": json.dumps(self._log), "seconds": self.seconds(),
-                             "config": json.dumps(self._config, default=str), "format": FORMAT}  # fmt: skip
+                             "config": json.dumps(self._config), "format": FORMAT}  # fmt: skip
             atomic_write(self.folder / "policy.pt", lambda file: torch.save(policy, file))
             atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))  # last

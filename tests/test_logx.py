@@ -372,10 +372,10 @@ def test_an_epochs_row_is_the_mean_of_its_episodes_and_updates_and_blank_where_n
 
 
 @pytest.mark.parametrize("weight", [math.nan, math.inf])
-def test_a_weight_that_is_not_finite_ends_the_run_and_says_how_to_go_on(tmp_path, weight):
+def test_a_weight_that_is_not_finite_ends_the_run_and_says_what_to_do(tmp_path, weight):
     net = torch.nn.Linear(1, 1)
     torch.nn.init.constant_(net.weight, weight)
-    with folder_of(tmp_path / "a") as run, pytest.raises(logx.NotFinite, match="--resume"):
+    with folder_of(tmp_path / "a") as run, pytest.raises(logx.NotFinite, match="smaller learning rates"):
         run.begin()
         run.log_updates({"L_C": 0.0, "L_A": 0.0}, net)
 
@@ -420,9 +420,26 @@ def test_a_resume_without_a_checkpoint_begins_a_new_run_and_says_so(tmp_path, ca
     assert capsys.readouterr().out.startswith(f"{run.folder}: no checkpoint there, so this begins a new run\n")
 
 
+def test_a_published_run_is_not_begun_again_in_its_place(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "episodes.csv.gz").touch()
+    with pytest.raises(BadInput, match="is a published run"):
+        folder_of(tmp_path / "a", resume=True)
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["episodes.csv.gz"]
+
+
+def test_a_run_whose_output_nobody_reads_does_not_end_as_done():
+    code = "import logx; logx.run_script(lambda: [print(i) for i in range(10**5)] and None)"
+    shell = f"{sys.executable} -c '{code}' | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", shell], cwd=Path(logx.__file__).parent, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_a_run_at_its_end_is_finished_and_goes_on_with_more_epochs(stopped, capsys):
     with folder_of(stopped, resume=True, epochs=1) as run:
-        assert run.finished() and "finished, 50 steps; more with --epochs" in capsys.readouterr().out
+        assert (
+            run.finished() and f"finished, 50 steps; more with --resume {stopped} --epochs" in capsys.readouterr().out
+        )
     with folder_of(stopped, resume=True, epochs=9) as run:
         assert not run.finished()
         run.begin()
