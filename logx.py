@@ -125,7 +125,8 @@ def parse_flags(cls, doc, argv=None):
     """The command line of a dataclass whose fields are made by `flag`: its name is the flag, its annotation the type.
 
     `X | None` defaults to what the help says; `bool` is --flag, `bool | None` also --no-flag; tuples take spaces;
-    `bool | str` may stand alone or with a value. Raises BadInput where a value is not allowed.
+    `bool | str` may stand alone or with a value. --resume FOLDER takes what is not asked for from the run there (see
+    `recorded`). Raises BadInput where a value is not allowed.
     """
     parser = _Parser(description=doc, usage=argparse.SUPPRESS, allow_abbrev=False,
                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
@@ -139,7 +140,7 @@ def parse_flags(cls, doc, argv=None):
         if isinstance(shown, tuple):
             shown = " ".join(map(str, shown))
         default = "" if shown is None or isinstance(shown, bool) or shown == "" else f"(default: {shown})"
-        options = {"default": field.default, "help": f"{about['help'] or ''} {default}".strip().replace("%", "%%")}
+        options = {"default": argparse.SUPPRESS, "help": f"{about['help'] or ''} {default}".strip().replace("%", "%%")}
         if kinds == [bool, str]:
             options |= {"nargs": "?", "const": True, "metavar": about["metavar"]}
         elif kind is bool and not field.default:
@@ -158,11 +159,11 @@ def parse_flags(cls, doc, argv=None):
     values, unknown = parser.parse_known_args(argv)
     if unknown:  # --batch-size and --batchsize are told --batch_size
         name = unknown[0].split("=")[0]
-        near = difflib.get_close_matches(name, [f"--{field}" for field in vars(values)], 1)
+        flags = [f"--{field.name}" for field in dataclasses.fields(cls) if field.metadata]
+        near = difflib.get_close_matches(name, flags, 1)
         raise BadInput(f"{name}: no such flag" + (f"; did you mean {near[0]}?" if near else "; --help lists them"))
-    for name, value in vars(values).items():
-        setattr(values, name, tuple(value) if isinstance(value, list) else value)
-    return check_flags(cls(**vars(values)))
+    asked = {name: tuple(value) if isinstance(value, list) else value for name, value in vars(values).items()}
+    return check_flags(recorded(cls, asked) if isinstance(asked.get("resume"), str) else cls(**asked))
 
 
 def check_flags(flags):
@@ -189,24 +190,21 @@ FREE = {field.name for field in dataclasses.fields(RunFlags)} | {"epochs"}  # wh
 NOT_A_VARIANT = FREE | {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed"}
 
 
-def recorded(flags):
-    """With --resume FOLDER, the flags that the run there was begun with, and what else was asked for now; else the
-    flags as they are. Raises BadInput where the folder holds no run of this script."""
-    if not isinstance(flags.resume, str):
-        return flags
-    folder = Path(flags.resume)
+def recorded(cls, asked):
+    """The flags, a `cls`, that the run in the folder asked["resume"] was begun with, but for what is `asked` for now,
+    {flag: value}, and how loud it was. Raises BadInput where the folder holds no run of this script."""
+    folder = Path(asked["resume"])
     folder = folder.resolve() if folder.name in ("", "..") else folder
     try:
         config = json.loads((folder / "config.json").read_text())
-        fields = {field.name: field.default for field in dataclasses.fields(flags)}
+        fields = {field.name for field in dataclasses.fields(cls)}
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
-        if missing := set(fields) - set(before):
+        if missing := fields - set(before):
             raise ValueError(f"its config.json lacks {', '.join(sorted(missing))}")
     except (OSError, ValueError, AttributeError) as error:
         raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
-    asked = {name: v for name, v in dataclasses.asdict(flags).items() if v != fields[name]}
     where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}
-    return dataclasses.replace(flags, **(before | asked | where))
+    return cls(**(before | {"quiet": False} | asked | where))
 
 
 def fill_in(flags, defaults, algo):

@@ -98,7 +98,6 @@ def recipe_defaults(task, recipe, num_demos=None):
 
 def resolve(flags):
     """The flags with what task and recipe decide in place of None, and a name. Raises logx.BadInput."""
-    flags = logx.recorded(flags)
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))

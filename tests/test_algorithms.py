@@ -190,7 +190,7 @@ def test_a_run_that_is_interrupted_and_resumed_equals_one_that_never_stopped(scr
 def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(script, world, capsys):
     """--resume FOLDER --epochs N: all other flags are those on record."""
     whole, first = world("whole"), world("a", epochs=2)
-    asked = script.Flags(resume=str(first.folder), epochs=3)
+    asked = logx.recorded(script.Flags, {"resume": str(first.folder), "epochs": 3, "quiet": True})
     again = run_flags(script, asked)
     assert not again.error and len(again.steps) < 120 and curves(first.folder) == curves(whole.folder)
     finished = run_flags(script, asked)
