@@ -461,13 +461,15 @@ def markdown(lines):
 
 
 def main_group(task, runs, recipe=None):
-    """The runs of the group (of this recipe) with its recipe's own symmetry and most runs, of the paper's columns where
-    it can be."""
+    """The runs of the group (of this recipe) with its recipe's own symmetry and length and most runs, of the paper's
+    columns where it can be."""
     runs = runs[(runs.task == task) & (runs.algo != "pid") & ((runs.recipe == recipe) | (recipe is None))]
     printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
-    groups = (printed if len(printed) else runs).groupby(GROUP).size().reset_index(name="size")
-    groups["own"] = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)
-    groups = groups.sort_values(["own", "size"], kind="stable")[GROUP]
+    groups = (printed if len(printed) else runs).groupby(GROUP).curves.agg(list).reset_index(name="members")
+    own = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)
+    length = [not any("-epochs=" in curves.folder.name for curves in members) for members in groups.members]
+    groups = groups.assign(own=own, length=length, size=groups.members.map(len))
+    groups = groups.sort_values(["own", "length", "size"], kind="stable")[GROUP]
     return runs[(runs[GROUP] == list(groups.iloc[-1])).all(axis=1)] if len(groups) else runs
 
 

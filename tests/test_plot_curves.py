@@ -168,6 +168,15 @@ def test_the_lambda_sweep_of_p2po_is_matched_by_sweep_and_value(tmp_path):
     assert (sweep["paper"], sweep["mean"], demos["paper"], demos["mean"]) == (96.2, 100, 71.6, 0)
 
 
+def test_the_main_group_has_its_recipes_own_symmetry_and_length_whatever_else_has_more_runs(tmp_path):
+    write_run(tmp_path / "runs/own")
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/short-epochs=1-seed{seed}", epochs=1, steps=2000, seed=seed)
+        write_run(tmp_path / f"runs/none{seed}", symmetry="none", seed=seed)
+    (run,) = tables.main_group("p2p", tables.find_runs()[0]).curves
+    assert run.folder.name == "own"
+
+
 @pytest.mark.parametrize("config", [{"lambda_bc": 7.5}, {"num_demos": 80}, {"algo": "sac", "recipe": "sb3"}])
 def test_a_run_of_no_printed_column_is_listed_as_not_in_the_papers_table(tmp_path, config):
     write_run(tmp_path / "runs/a", **config)
