@@ -206,10 +206,14 @@ def find_runs(named=None):
     return runs.sort_values([*GROUP, *COLUMN[1:], "seed"], ignore_index=True), remarks
 
 
+def own_symmetry(runs):
+    """Whether each run has its recipe's symmetry; runs of no recipe (the PID, Stable-Baselines3) have."""
+    return runs.symmetry == runs.recipe.map(OWN_SYMMETRY).fillna(runs.symmetry)
+
+
 def of_task(runs, task, variants=False):
     """The runs of a task; of the recipes alone, each with its own symmetry, unless `variants`."""
-    own = (runs.variant == "") & (runs.symmetry == runs.recipe.map(OWN_SYMMETRY).fillna(runs.symmetry))
-    return runs[(runs.task == task) & (variants | own)]
+    return runs[(runs.task == task) & (variants | ((runs.variant == "") & own_symmetry(runs)))]
 
 
 def columns(task, runs=None):
@@ -396,8 +400,7 @@ def compared_lines(kind, runs):
     take, success of all own episodes while training, each with Welch's difference. Where what a variant is compared
     with has no runs of its length, the test study of its longest is the reference."""
     by, base, held = COMPARED[kind]
-    own = runs.symmetry == runs.recipe.map(OWN_SYMMETRY).fillna(runs.symmetry)
-    wanted = {"variant": own, "symmetry": runs.variant == "",
+    wanted = {"variant": own_symmetry(runs), "symmetry": runs.variant == "",
               "K": (runs.symmetry == "gas") & runs.variant.str.fullmatch(r"(partitions=\d+)?")}[by]  # fmt: skip
     runs = runs[runs.finished & (runs.algo != "pid") & wanted]
     alike = [name for name in GROUP[:-1] if name != by and (by, name) != ("K", "variant")]
@@ -466,8 +469,8 @@ def main_group(task, runs, recipe=None):
     runs = runs[(runs.task == task) & (runs.algo != "pid") & ((runs.recipe == recipe) | (recipe is None))]
     printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
     groups = (printed if len(printed) else runs).groupby(GROUP).curves.agg(list).reset_index(name="members")
-    own = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)
     length = [not any("-epochs=" in curves.folder.name for curves in members) for members in groups.members]
+    own = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)  # not own_symmetry: a recipe goes before none
     groups = groups.assign(own=own, length=length, size=groups.members.map(len))
     groups = groups.sort_values(["own", "length", "size"], kind="stable")[GROUP]
     return runs[(runs[GROUP] == list(groups.iloc[-1])).all(axis=1)] if len(groups) else runs
