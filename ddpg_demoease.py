@@ -99,7 +99,7 @@ def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
     T = max_ep_len or TASKS[task].horizon
     defaults = TASK_DEFAULTS[task] | dict(max_ep_len=TASKS[task].horizon, steps_per_epoch=5 * T)
     defaults |= dict(update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
-    defaults |= PAPER if recipe == "paper" else ROBUST | ROBUST_TASK[task]
+    defaults |= PAPER if recipe == "paper" else ROBUST | ROBUST_TASK.get(task, {})
     return defaults | ({"keep_clone": 0.0} if clone_iters == 0 else {})
 
 
@@ -176,7 +176,7 @@ def store_last_step(B, episode, n, gamma, timeout_ends=False):
 
 def store_demonstrations(demos, B_o, B_d, f):
     """B_d gets what the demonstrator asked for, B_o what was done, which is another thing where noise was added: then
-    Eq. 8 asks the critic about actions that it has not seen. Of B_d, s and a alone are used."""
+    Eq. 8 asks the critic about actions that it has not seen. Of B_d, s and a alone are used: r is of what was done."""
     episode, columns = [], [demos[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated")]
     for (s, a, *rest), executed in zip(zip(*columns, strict=True), demos.get("executed", demos["act"]), strict=True):
         B_d.store(*n_step_sum([(s, a, *rest)], f.gamma, f.timeout_ends))

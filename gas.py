@@ -21,9 +21,7 @@ import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-SYMMETRIES = ("none", "gas", "so2", "canonical", "cylinder", "mirror")  # of --symmetry
-
-# By observation width, 22 or 25: {how it rotates: [first index, ...]} and the row of a task of that width.
+# By observation width, 22 or 25: {how it rotates: [first index, ...]} and a task of it; their sectors are alike.
 _ROTATES, _TASK = {}, {}
 for _task, _layout in OBSERVATION.items():
     _ROTATES[OBS_DIM[_task]], _TASK[OBS_DIM[_task]] = {}, _task
@@ -131,10 +129,12 @@ def mirror(obs, action):
 
 def seen(obs, symmetry):
     """The state as networks see it under --symmetry: (..., 22 or 25), of `none`, `gas` and `so2` as it is."""
-    return _VIEWS[symmetry](obs) if symmetry in _VIEWS else obs
+    return _VIEWS[symmetry](obs)
 
 
-_VIEWS = {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}
+_VIEWS = dict.fromkeys(("none", "gas", "so2"), lambda obs: obs)
+_VIEWS |= {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}
+SYMMETRIES = tuple(_VIEWS)  # of --symmetry; whatever maps demonstrations also asks for "gas" by name
 
 
 def partition_of(obs, K=4):

@@ -34,7 +34,7 @@ class Task:
     test_theta: float  # start angle of the test study
 
 
-TASKS = {
+TASKS = {  # a new one also needs OBSERVATION, TASK_DEFAULTS in the algorithm files, TITLES and NUMBERS in tables.py
     "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4),
     "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2),
     "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2),
@@ -63,7 +63,7 @@ for _task, _layout in OBSERVATION.items():
 # No entry leaves [-bound, bound]: the arm reaches 1.33 m, and 20 rad/s is far beyond what its motors can do.
 BOUND = {"q": math.pi, "sin q": 1.0, "cos q": 1.0, "q_dot": 20.0, "P_g": 2.0, "e": 4.0, "P_o": 2.0}
 
-# Where goals are drawn, radius and height in m (Eq. 10): on train and test, and on demo.
+# Where goals are drawn, radius and height in m (Eq. 10): on train and test, and on demo. All are within reach.
 RHO, Z = (0.3, 0.7), (0.25, 0.65)
 RHO_DEMO, Z_DEMO = (0.4, 0.6), (0.35, 0.55)
 CUBE_DRAWS = 50  # of a P&P cube for one goal
@@ -421,12 +421,12 @@ class KinovaEnv(gymnasium.Env):
         pybullet.resetBasePositionAndOrientation(self._cube, self.cube, turned, self._client)
 
     def step(self, action):
-        """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it has a NaN."""
+        """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it is none."""
         if self.goal is None:
             raise RuntimeError(f"step() {'after close()' if self._client is None else 'before reset()'}")
         action = action.tolist() if isinstance(action, np.ndarray) else list(action)  # a copy: it is kept
-        if any(a != a for a in action):
-            raise ValueError(f"action {action!r}: has a NaN")
+        if len(action) != 4 or any(a != a for a in action):
+            raise ValueError(f"action {action!r}: must be 4 numbers, none NaN")
         velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
         self._actions.append(action)
         client = self._client

@@ -131,7 +131,9 @@ class PID:
                 return found
 
     def _nearest(self, found):
-        """Of postures (M, 4) the one nearest to the present."""
+        """Of postures (M, 4) the one nearest to the present. Raises ValueError where there is none."""
+        if not len(found):
+            raise ValueError(f"goal {self.env.goal}: out of the arm's reach")
         q = np.array(self.env.q)
         return found[np.argmin(wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1))]
 
@@ -216,6 +218,12 @@ def load_demos(path, task=None):
                 raise ValueError(f"its {name} is {demos[name].shape}, {shape} is expected")
             if not np.all(np.isfinite(demos[name])):
                 raise ValueError(f"nan or inf in its {name}")
+            if name in ("act", "executed") and np.abs(demos[name]).max(initial=0) > 1:
+                raise ValueError(f"its {name} leaves [-1, 1]")
+        if not np.array_equal(demos["episode"], np.repeat(np.arange(episodes), demos["length"])):
+            raise ValueError("its episode does not count from 0 as its length says")
+        if not (demos["terminated"] | demos["truncated"])[np.cumsum(demos["length"]) - 1].all():
+            raise ValueError("an episode's last step is neither terminated nor truncated")
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
     except ImportError:
@@ -299,6 +307,9 @@ def given(path, task, symmetry, partitions):
         raise logx.BadInput(f"--demos {path}: of {meta['partitions']} partitions, not --partitions {partitions}")
     if symmetry == "gas" and meta["symmetry"] != "gas":
         demos = gas.aggregate(demos, partitions)
+    if not len(demos["length"]):
+        raise logx.BadInput(f"--demos {path}: has no episode of partition 0, which --symmetry gas maps to the others; "
+                            "others: --symmetry none, so2, canonical, cylinder or mirror")  # fmt: skip
     return demos, meta
 
 

@@ -71,8 +71,8 @@ class Flags(logx.RunFlags):
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 4000", low=0)
-    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d")
-    grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; pnp only")
+    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d; robust: yes")
+    grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
 TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5

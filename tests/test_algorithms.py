@@ -517,6 +517,18 @@ def test_all_demonstrations_of_a_file_are_taken_unless_fewer_are_asked_for(scrip
     assert script.resolve(script.Flags(task="p2p", demos=demo_file, symmetry="gas")).num_demos == 4 * in_first
 
 
+def test_a_file_without_an_episode_of_partition_0_has_nothing_to_map(script, demo_file, tmp_path):
+    with np.load(demo_file) as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "d.npz", **arrays | {"partition": arrays["partition"] | 1})
+    elsewhere = script.Flags(task="p2p", demos=str(tmp_path / "d.npz"))
+    assert script.resolve(replace(elsewhere, symmetry="none")).num_demos == len(arrays["length"])
+    for N in (None, 2):
+        with pytest.raises(logx.BadInput, match="--demos .*no episode of partition 0.*--symmetry none"):
+            script.train(replace(elsewhere, symmetry="gas", num_demos=N, data_dir=tmp_path))
+    assert not list(tmp_path.glob("*/"))
+
+
 @pytest.mark.parametrize("rule", BAD)
 def test_bad_input_is_a_value_error_that_names_the_flag_and_leaves_no_folder(script, rule, tmp_path, demo_file):
     flags, says = BAD[rule]
