@@ -271,6 +271,18 @@ def over_seeds(metric, values):
     return mean, *(np.clip(ends, 0, 100) if metric == "P_scs_percent" else ends)
 
 
+def difference(metric, a, b):
+    """evaluate.difference, which does not know that percentages differ by 100 points at most."""
+    gap, *ends = evaluate.difference(a, b)
+    return gap, *(np.clip(ends, -100, 100) if metric == "P_scs_percent" else ends)
+
+
+def separated(a, b):
+    """Whether all of a lie above, or all below, all of b, where chance alone does so at most 1 time in 20 (permutation
+    test): near 100 %, seeds are not normal, and Welch's interval is wide."""
+    return math.comb(len(a) + len(b), len(a)) >= 40 and bool(np.min(a) > np.max(b) or np.max(a) < np.min(b))
+
+
 def measured(kind, runs):
     """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies, BEST and LATE."""
     found = {}
@@ -300,6 +312,8 @@ def table(kind, task, runs):
                 for metric, digits in METRICS[kind].items():
                     values = np.array([metrics.get(metric, math.nan) for _, metrics in seeds])
                     (mean, low, high), method = over_seeds(metric, values), "over seeds"
+                    if what == BEST:  # of a maximum, Student's t says nothing
+                        low = high = math.nan
                     if kind == "test" and len(seeds) == 1 and what not in (BEST, LATE):
                         trials = seeds[0][0].curves.evaluations[what]
                         (low, high), method = evaluate.over_trials(trials)[metric], "over trials"
@@ -308,7 +322,8 @@ def table(kind, task, runs):
                         "metric": metric, "paper": paper, "mean": mean, "low": low, "high": high,
                         "interval": method if low == low else "", "na_seeds": int(np.isnan(values).sum()),
                         # as printed, so that the mark agrees with what the reader sees
-                        "paper_outside": int((paper < round(low, digits) or paper > round(high, digits)) and not what),
+                        "paper_outside": int((paper < round(low, digits) or paper > round(high, digits)) and not what
+                                             and group[1] != "fast"),  # the paper has one controller
                         "values": values})  # fmt: skip
         if len(rows) == begun and column.sweep != "other" and (column.sweep != "pid" or kind == "test"):
             none = dict.fromkeys(GROUP[1:], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
@@ -327,8 +342,8 @@ def group_label(group):
 
 
 def between(mean, low, high, digits):
-    """mean [low, high] as text, - where there is none."""
-    ends = f" [{low:.{digits}f}, {high:.{digits}f}]" if low == low else " [-]"
+    """mean [low, high] as text, - where there is none, as of a single seed or of seeds that show no spread."""
+    ends = f" [{low:.{digits}f}, {high:.{digits}f}]" if low < high else " [-]"
     return f"{mean:.{digits}f}{ends}" if mean == mean else "-"
 
 
@@ -389,10 +404,11 @@ def undecided(kind, rows):
             label = group_label([getattr(one, name) for name in GROUP])
             found[verdict][f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
                            f"{between(gap, low, high, METRICS[kind][metric])} ({label})"] = None  # fmt: skip
-    head = f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference:"
-    counts = ", ".join(f"{len(pairs)} we {verdict}" for verdict, pairs in list(found.items())[:3])
-    return [f"{head} {counts}" + f"; {len(found['too few'])} of a single seed" * bool(found["too few"]),
-            *found["rank the other way"], *found["cannot tell apart"]]  # fmt: skip
+    *known, few = found.values()
+    counts = ", ".join(f"{len(pairs)} we {verdict}" for verdict, pairs in zip(found, known, strict=False))
+    head = f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference: {counts}"
+    heads = [head + f"; {len(few)} of a single seed" * bool(few)] * any(found.values())
+    return [*heads, *found["rank the other way"], *found["cannot tell apart"]]
 
 
 def compared_lines(kind, runs):
@@ -424,8 +440,8 @@ def compared_lines(kind, runs):
             ):
                 values, others = ([getattr(curves, name) for curves in side] for side in (part, reference))
                 metric = "" if name == "trial_steps" else "P_scs_percent"
-                cells += [between(*over_seeds(metric, values), digits),
-                          between(*evaluate.difference(values, others), digits)]  # fmt: skip
+                gap = between(*difference(metric, values, others), digits) + " †" * separated(values, others)
+                cells += [between(*over_seeds(metric, values), digits), gap]
             by_seed = " ".join("-" if (x := curves.success) != x else f"{x:.1f}" for curves in part)
             about, label = members.iloc[0], group_label([f"{value}" or "the recipe's", steps])
             lines.append([" ".join(about[name] for name in alike if about[name]), f"{about.lambda_bc:g}", label,
@@ -443,8 +459,16 @@ def make_table(kind, task, runs, variants=False):
     else:
         lines = compared_lines(kind, of_task(runs, task, variants=True))
         base = {"ablations": "the recipe", "symmetries": "no symmetry", "partitions": "K = 4"}[kind]
-        notes = [f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch."]
-        notes, rows = notes + ["  no runs"] * (len(lines) == 1), pd.DataFrame(lines[1:], columns=lines[0])
+        notes = [
+            f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch; [-]: no spread to see.",
+            "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (permutation test).",
+        ]
+        if kind == "ablations":
+            notes += [
+                "Where the recipe was not run at a variant's length, the reference is its longest runs.",
+                "While training, each row explores in its own way; without `clone_iters` it begins untrained.",
+            ]
+        notes, rows = notes if len(lines) > 1 else ["  no runs"], pd.DataFrame(lines[1:], columns=lines[0])
         title = f"{TITLES[task]}, {kind}"
     text = "\n".join([title, "", aligned(lines), "", *notes])
     return text, "\n".join([markdown(lines), "", *(f"{note}  " for note in notes)]), rows

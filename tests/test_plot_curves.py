@@ -243,10 +243,10 @@ def test_ablations_are_compared_with_the_recipe_alone_and_left_out_of_the_papers
     write_run(tmp_path / "runs/short", seed=0, success=(0, 0), epochs=1, steps=2000, variant="pi_lr=0.0")
     runs, _ = tables.find_runs()
     lines = tables.compared_lines("ablations", runs)
-    same, half = "100.0 [100.0, 100.0]", ["50.0 [50.0, 50.0]", "-50.0 [-50.0, -50.0]"]
+    same, half = "100.0 [-]", ["50.0 [-]", "-50.0 [-]"]  # seeds that all agree show no spread
     assert [[line[2], *line[5:]] for line in lines[1:]] == [
-        ["the recipe's 4k steps", "100.0 100.0", same, "-", "4 [4, 4]", "-", same, "-"],
-        ["n_step=1 4k steps", "50.0 50.0", *half, "3 [3, 3]", "-0 [-0, -0]", *half],
+        ["the recipe's 4k steps", "100.0 100.0", same, "-", "4 [-]", "-", same, "-"],
+        ["n_step=1 4k steps", "50.0 50.0", *half, "3 [-]", "-0 [-]", *half],
         ["pi_lr=0.0 2k steps", "0.0", "0.0 [-]", "-100.0 [-]", "-", "-", "0.0 [-]", "-"]]  # fmt: skip
     assert table("test").seeds.max() == 2 and "n_step" not in tables.make_table("test", "p2p", runs)[0]
 
@@ -283,7 +283,7 @@ def test_mapped_demonstrations_may_be_a_margin_worse_than_as_many_recorded_ones(
             )
     found = [line[3:] for line in publish.findings_lines(tables.find_runs()[0]) if line[0].startswith("Symmetric")]
     assert [line[1:] for line in found] == [["2 and 2", "*holds*"]] * 2
-    assert [line[0] for line in found] == ["100.0 [100.0, 100.0] points", "0.0 [0.0, 0.0] points"]
+    assert [line[0] for line in found] == ["100.0 [-] points", "0.0 [-] points"]
 
 
 @pytest.mark.parametrize("ours, verdict", [
@@ -297,12 +297,33 @@ def test_a_finding_is_what_the_interval_of_the_difference_says(tmp_path, ours, v
     assert found["The agent beats its demonstrator"] == f"*{verdict}*" and found["The mask matters"] == ""
 
 
+def test_an_agent_is_compared_with_the_pid_that_it_was_shown_of_which_the_success_is_told(tmp_path):
+    for gains, success in (("authors", (1, 0)), ("fast", (1, 1))):
+        write_run(tmp_path / f"runs/pid-{gains}", success=success, **PID | {"gains": gains})
+    for seed in (0, 1):
+        for variant, gains in (("", "fast"), ("gains=authors", "authors")):
+            write_run(tmp_path / f"runs/{gains}{seed}", seed=seed, success=(1, 1), variant=variant, gains=gains)
+    lines = publish.findings_lines(tables.find_runs()[0])
+    assert [line[2:] for line in lines if line[0] == "The agent beats its demonstrator"] == [
+        ["ddpg robust mirror 4k steps, and the PID with fast gains in the same trials (100.0 %)",
+         "0.0 [-] points", "2", "*cannot be told apart*"],
+        ["ddpg robust mirror gains=authors 4k steps, and the PID with authors gains in the same trials (50.0 %)",
+         "50.0 [-] points", "2", "*holds*"]]  # fmt: skip
+
+
+def test_seeds_that_all_lie_on_one_side_are_marked_where_chance_seldom_does_that():
+    assert tables.separated([1, 2, 3], [4, 5, 6, 7, 8]) and tables.separated([9, 9, 9, 9], [1, 1, 1, 8])
+    assert not tables.separated([1, 2, 3], [4, 5, 6])  # 1 time in 10
+    assert not tables.separated([1, 2, 4], [4, 5, 6, 7, 8]) and not tables.separated([1, 2, math.nan], [4] * 5)
+    assert tables.difference("P_scs_percent", [0, 90], [100, 100])[1] == -100
+
+
 def test_what_went_on_inside_is_shown_after_a_tenth_half_and_all_of_a_run(tmp_path):
     run = write_run(tmp_path / "runs/a")
     rows = "".join(f"{i},{200 * i},0,{i},{i},nan\n" for i in range(1, 21))
     (run / "progress.csv").write_text("epoch,env_steps,demo_env_steps,seconds,Q_max,eval_success\n" + rows)
     (line,) = [line for line in publish.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
-    assert line[1] == "DDPG, robust" and line[5] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
+    assert line[1] == "DDPG, robust" and line[6] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
 
 
 # ---- which runs ------------------------------------------------------------------------------------------------------
