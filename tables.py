@@ -153,15 +153,20 @@ class Curves:
                 raise BadInput(f"{path}: no trial; run evaluate.py again")
         return dict(sorted(found.items()))
 
+    @cached_property
+    def tested(self):
+        """The metrics of the test study; none where there was none."""
+        return evaluate.metrics(self.evaluations[""]) if "" in self.evaluations else {}
+
     @property
     def success(self):
         """P_scs of the test study in percent; NaN where there was none."""
-        return evaluate.metrics(self.evaluations[""])["P_scs_percent"] if "" in self.evaluations else math.nan
+        return self.tested.get("P_scs_percent", math.nan)
 
     @property
     def trial_steps(self):
         """Mean steps of the test study's successful trials; NaN where there are none."""
-        return evaluate.metrics(self.evaluations[""])["steps"] if "" in self.evaluations else math.nan
+        return self.tested.get("steps", math.nan)
 
     @property
     def own_success(self):
