@@ -180,8 +180,11 @@ def learning_figure(task, runs, flags):
 
 def success_figure(task, runs, flags):
     """Success in the trials while training over environment steps, a line a method: of a recipe and symmetry the
-    paper's best column and the one without demonstrations; of other algorithms, and where --runs names runs, all."""
+    paper's best column, with other demonstrations (--demos) too, and the one without any; of other algorithms, and
+    where --runs names runs, all."""
     best = tables.best_column(task)
+    if not flags.runs:
+        runs = pd.concat((tables.of_task(runs, task), runs[runs.variant.str.fullmatch("demos=[^=]*")]))
     runs = runs[np.array([len(curves.validation) > 0 for curves in runs.curves], bool)]
     plain, other = (runs.num_demos == 0) & (runs.lambda_bc == 0), runs.algo != best.algo
     at_best = (runs[COLUMN] == [getattr(best, name) for name in COLUMN]).all(axis=1)
@@ -461,7 +464,7 @@ def workspace_figure(task=None, runs=None, flags=None):
 
 def save_figure(name, task, runs, flags, paths, dpi=200):
     """Whether there was something to draw."""
-    variants = bool(flags.runs) or name == "symmetry"  # which is K's too
+    variants = bool(flags.runs) or name in ("symmetry", "success")  # K's, and other demonstrations too
     runs = tables.of_task(runs, task, variants) if task else None
     with matplotlib.rc_context(LOOK):  # some texts come into being while it is drawn
         figure = globals()[f"{name}_figure"](task, runs, flags)

@@ -81,7 +81,7 @@ def cell(rows, metric, sweep="lambda", num_demos=100, lambda_bc=1.8, evaluation=
 
 
 def figure(name, task="p2p", named=None, **flags):
-    runs = tables.of_task(tables.find_runs(named)[0], task, variants=name == "symmetry")
+    runs = tables.of_task(tables.find_runs(named)[0], task, variants=name in ("symmetry", "success"))
     return getattr(plot_curves, f"{name}_figure")(task, runs, Flags(**flags))
 
 
@@ -418,13 +418,15 @@ def test_a_curve_is_the_mean_over_all_seeds_up_to_the_shortest_with_a_band_then_
 def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstrations_and_other_algorithms(tmp_path):
     plain = {"num_demos": 0, "lambda_bc": 0}
     sac = plain | {"algo": "sac", "recipe": "sb3", "symmetry": "none"}
-    for i, config in enumerate(({}, {"seed": 1}, plain, sac, {"lambda_bc": 0.6}, {"epochs": 1})):
+    given, other = {"variant": "demos=own.npz"}, {"variant": "n_step=1"}
+    for i, config in enumerate(({}, {"seed": 1}, plain, sac, {"lambda_bc": 0.6}, {"epochs": 1}, given, other)):
         write_run(tmp_path / f"runs/{i}", **config)
     (ax,) = figure("success").axes
-    assert sorted(legend(ax)) == ["SAC sb3 none, $N_{demos}=0$ (1 seed)", "robust mirror (2 seeds)",
-                                  "robust mirror, $N_{demos}=0$ (1 seed)"]  # fmt: skip
+    assert sorted(legend(ax)) == [
+        "SAC sb3 none, $N_{demos}=0$ (1 seed)", "robust mirror (2 seeds)", "robust mirror demos=own.npz (1 seed)",
+        "robust mirror, $N_{demos}=0$ (1 seed)"]  # fmt: skip
     assert all(line.get_xydata().tolist() == [[2000, 50]] for line in ax.lines)
-    assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 4
+    assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 6
 
 
 def test_runs_named_with_runs_are_all_drawn_whatever_their_flags(tmp_path):
