@@ -178,8 +178,8 @@ def comparisons(task, runs):
         if variant == "mask=none":
             masked = at.get((algo, recipe, symmetry, "", total), {})
             yield "mask", f"{label}, and with the mask", masked.get(key), found.get(key), 0
-        other_length = any("-epochs=" in curves.folder.name for side in found.values() for curves in side)
-        if variant not in ("", *(f"gains={name}" for name in pid_demo.GAINS)) or (other_length and not variant):
+        own_length = all(curves.own_length for side in found.values() for curves in side)
+        if variant not in ("", *(f"gains={name}" for name in pid_demo.GAINS)) or not (variant or own_length):
             continue  # a recipe of another length is there for the ablations
         gains = found[key][0].config["gains"] if key in found else None
         theirs = pid.get(gains)

@@ -169,6 +169,11 @@ class Curves:
         return self.tested.get("steps", math.nan)
 
     @property
+    def own_length(self):
+        """Whether it was asked for as many epochs as its recipe has; else its folder names them (logx.fill_in)."""
+        return "-epochs=" not in self.folder.name
+
+    @property
     def own_success(self):
         """Percent of the own episodes while training that succeeded, exploration and all."""
         return 100 * self.episodes.success.mean()
@@ -498,7 +503,7 @@ def main_group(task, runs, recipe=None):
     runs = runs[(runs.task == task) & (runs.algo != "pid") & ((runs.recipe == recipe) | (recipe is None))]
     printed = runs.merge(columns(task)[COLUMN].drop_duplicates())
     groups = (printed if len(printed) else runs).groupby(GROUP).curves.agg(list).reset_index(name="members")
-    length = [not any("-epochs=" in curves.folder.name for curves in members) for members in groups.members]
+    length = [all(curves.own_length for curves in members) for members in groups.members]
     own = groups.symmetry == groups.recipe.map(OWN_SYMMETRY)  # not own_symmetry: a recipe goes before none
     groups = groups.assign(own=own, length=length, size=groups.members.map(len))
     groups = groups.sort_values(["own", "length", "size"], kind="stable")[GROUP]
