@@ -288,15 +288,28 @@ def mean_of_tenth(values, share):
     return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
 
 
+def study(run):
+    """What a run, a row of tables.find_runs, is there for."""
+    if run.recipe not in tables.OWN_SYMMETRY:
+        return "other libraries"
+    if run.recipe == "paper":
+        return "as published"
+    printed = columns(run.task)[COLUMN[1:]].values.tolist()
+    if run.symmetry != tables.OWN_SYMMETRY[run.recipe] or [run.num_demos, run.lambda_bc] not in printed:
+        return "robust, symmetries and K"
+    return "robust, ablations" if run.variant or not run.curves.own_length else "robust, the paper's columns"
+
+
 def cost_lines(runs):
     """What the published runs took on one core, validation trials included, the test study not."""
-    lines = [["task", "algorithm", "recipe", "runs", "environment steps", "core-hours"]]
     trained = runs[runs.algo != "pid"]
-    for (task, algo, recipe), part in trained.groupby(["task", "algo", "recipe"]):
-        seconds = sum(run.progress.seconds.max() for run in part.curves)
-        lines.append([TITLES[task], algo, recipe, f"{len(part)}", f"{part.steps.sum():,}", f"{seconds / 3600:.1f}"])
-    seconds = sum(run.progress.seconds.max() for run in trained.curves)
-    return [*lines, ["all", "", "", f"{len(trained)}", f"{trained.steps.sum():,}", f"{seconds / 3600:.1f}"]]
+    trained = trained.assign(study=[study(run) for run in trained.itertuples()],
+                             hours=[run.progress.seconds.max() / 3600 for run in trained.curves])  # fmt: skip
+    lines = [["what for", "task", "algorithm", "runs", "environment steps", "core-hours"]]
+    for (what, task, algo), part in [*trained.groupby(["study", "task", "algo"]), (("all", "", ""), trained)]:
+        cells = f"{len(part)}", f"{part.steps.sum():,}", f"{part.hours.sum():.1f}"
+        lines.append([what, TITLES.get(task, ""), algo, *cells])
+    return lines
 
 
 def pid_lines(runs):

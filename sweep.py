@@ -90,6 +90,7 @@ class Job:
     total: int
     words: tuple = ()  # script and flags
     kind: tuple = ()
+    clone_iters: int = 0
 
     @property
     def command(self):
@@ -207,18 +208,19 @@ def grid(flags):
                     command = (f"{SCRIPTS[algo]}.py", *words, "--seed", f"{seed}")
                     kind = (algo, task, f.recipe, f.variant, bool(f.num_demos))
                     folder = flags.data_dir / f.name
-                    jobs[folder] = Job(folder, f.epochs * f.steps_per_epoch, command, kind)
+                    jobs[folder] = Job(folder, f.epochs * f.steps_per_epoch, command, kind, f.clone_iters)
             except logx.BadInput as error:
                 raise logx.BadInput(f"{SCRIPTS[algo]}.py: {error}") from None
     return list(jobs.values())
 
 
-def rates(jobs):
-    """{job: environment steps a second}, updates included, of a short run of the same kind here, alone."""
+def costs(jobs):
+    """{job: seconds to come}, cloning and updates included, by a short run of the same kind here, alone."""
     measured = {}
     for kind, job in tqdm({job.kind: job for job in jobs}.items(), "measuring", leave=False, disable=None):
-        algo, *_, demos = kind
-        short = ["--epochs", "2", "--eval_every", "0", "--clone_iters", "1", "--num_demos", "4" if demos else "0"]
+        (algo, *_, demos), clone_iters = kind, min(job.clone_iters, 200)
+        short = ["--epochs", "2", "--eval_every", "0", "--num_demos", "4" if demos else "0"]
+        short += ["--clone_iters", f"{clone_iters}"] * bool(clone_iters)
         short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []
         with tempfile.TemporaryDirectory() as folder:
             words = (*job.words, *short, "--data_dir", folder, "--name", "rate")
@@ -227,8 +229,14 @@ def rates(jobs):
             if done.returncode:
                 raise logx.BadInput(done.stderr)
             steps, seconds = ([float(row[name]) for row in job.rows()] for name in ("env_steps", "seconds"))
-        measured[kind] = (steps[1] - steps[0]) / (seconds[1] - seconds[0])
-    return {job: measured[job.kind] for job in jobs}
+        epoch = seconds[1] - seconds[0]  # the first one has the cloning too
+        measured[kind] = epoch / (steps[1] - steps[0]), max(0, seconds[0] - epoch) / max(1, clone_iters)
+    cost = {}
+    for job in jobs:
+        a_step, a_clone_iter = measured[job.kind]
+        done = job.steps()
+        cost[job] = max(0, job.total - done) * a_step + (0 if done else job.clone_iters * a_clone_iter)
+    return cost
 
 
 def hours(seconds):
@@ -359,12 +367,11 @@ def main(argv=None):
         return print_status(jobs, flags.data_dir)
     states = {job: job.state()[0] for job in jobs}
     todo = [job for job in jobs if states[job] not in ("done", "running", "queued")]
-    rate = rates(todo) if flags.dry_run else {}
-    cost = {job: max(0, job.total - job.steps()) / rate[job] for job in rate}
+    cost = costs(todo) if flags.dry_run else {}
     for job in jobs:
         print(f"{states[job]:8} {hours(cost[job]) if job in cost else '':>8}  {shlex.join(['python', *job.words])}")
-    print(f"{len(jobs)} runs, {len(todo)} to do"
-          + f": {sum(cost.values()) / 3600:.1f} core-hours at the rates measured here" * flags.dry_run)  # fmt: skip
+    total = f": {sum(cost.values()) / 3600:.1f} core-hours by short runs here, evaluations not counted"
+    print(f"{len(jobs)} runs, {len(todo)} to do" + total * flags.dry_run)
     if flags.dry_run or not todo:
         return 0
     if flags.cluster:
