@@ -182,7 +182,7 @@ def success_figure(task, runs, flags):
     """Success in the trials while training over environment steps, a line a method: of a recipe and symmetry the
     paper's best column, with other demonstrations (--demos) too, and the one without any; of other algorithms, and
     where --runs names runs, all."""
-    best = tables.best_column(task)
+    best = tables.best_column(task, runs)
     if not flags.runs:
         runs = pd.concat((tables.of_task(runs, task), runs[runs.variant.str.fullmatch("demos=[^=]*")]))
     runs = runs[np.array([len(curves.validation) > 0 for curves in runs.curves], bool)]
@@ -217,7 +217,7 @@ def success_figure(task, runs, flags):
 def symmetry_figure(task, runs, flags):
     """Test success over the number of real demonstrations, a line a symmetry; and of `gas` over the number of
     partitions K, at as many real demonstrations and at as many after mapping. Robust runs of the commonest length."""
-    best = tables.best_column(task)
+    best = tables.best_column(task, runs)
     runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
     runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
     runs = runs[runs.finished & (runs.total_env_steps == runs.total_env_steps.mode().max())]
@@ -464,8 +464,10 @@ def workspace_figure(task=None, runs=None, flags=None):
 
 def save_figure(name, task, runs, flags, paths, dpi=200):
     """Whether there was something to draw."""
-    variants = bool(flags.runs) or name in ("symmetry", "success")  # K's, and other demonstrations too
-    runs = tables.of_task(runs, task, variants) if task else None
+    methods = name in ("symmetry", "success")  # K's, and other demonstrations too
+    runs = tables.of_task(runs, task, variants=bool(flags.runs) or methods) if task else None
+    if methods and not len(runs):
+        return False
     with matplotlib.rc_context(LOOK):  # some texts come into being while it is drawn
         figure = globals()[f"{name}_figure"](task, runs, flags)
         for path in paths if figure else ():
@@ -480,10 +482,10 @@ def save_figures(folder, runs, flags, ends, dpi=200):
     names = []
     for task, name in [*product(TASKS, DRAWINGS[:-2]), *product([None], OF_NO_TASK)]:
         recipes = [None]
-        if name in ("learning", "error"):
-            shown = tables.of_task(runs, task, variants=bool(flags.runs))
-            of_paper = set(shown[shown.algo == tables.best_column(task).algo].recipe)
-            recipes += sorted(of_paper - set(main_group(task, shown).recipe))
+        shown = tables.of_task(runs, task, variants=bool(flags.runs))
+        if name in ("learning", "error") and len(shown):
+            of_paper = shown[shown.algo == tables.best_column(task, shown).algo].recipe
+            recipes += sorted(set(of_paper) - set(main_group(task, shown).recipe))
         for recipe in recipes:
             file = "-".join(filter(None, ("fig", name, task, recipe)))
             paths = [folder / (file + end) for end in ends]

@@ -41,6 +41,7 @@ from tables import (
 )
 
 TRIALS = 500  # of the test study
+PRINTED = [task for task in TASKS if len(columns(task))]  # a task that the paper does not have is on no page
 PAGES = (HERE / "README.md", HERE / "DIFFERENCES.md", HERE / "data/results/README.md")
 INDEX_COLUMNS = ["name", "task", *GROUP[:-1], "num_demos", "lambda_bc", "seed", "env_steps", "finished", "eval_success",
          "P_scs_percent", "git_commit"]  # fmt: skip
@@ -205,7 +206,7 @@ def findings_lines(runs):
     """Each claim of the paper, the difference in our test success, and what it says: Welch's interval over seeds; with
     the PID, which is one controller, Student's of the differences from it in the same trials."""
     lines, said = [["claim", "task", "compared", "difference", "seeds", ""]], {}
-    found = ((task, *sides) for task in TASKS for sides in comparisons(task, runs[runs.task == task]))
+    found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
         least = 5 if claim == "quick" else 0  # percent: with less, next to no trial is one that both succeed in
         ours, theirs = ([curves for curves in side or () if curves.success >= least] for side in (one, other))
@@ -231,7 +232,7 @@ def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
     lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "steps: demonstrated + own",
               "command", "minutes"]]  # fmt: skip
-    for task in TASKS:
+    for task in PRINTED:
         printed, best = columns(task), best_column(task)
         (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
         of_task, agents = runs[(runs.task == task) & (runs.variant == "")], []
@@ -269,7 +270,7 @@ WATCHED = {"pretanh_own (PPO: mean_action_own)": ("pretanh_own", "mean_action_ow
 def watched_lines(runs):
     """What went on inside the first page's agents: means over the tenth of the run that ends at a tenth, half, all."""
     lines = [["task", "agent", *WATCHED, "own success (%)"]]
-    for task, recipe, algo in product(TASKS, ("robust", "paper"), ("ddpg", "ppo")):
+    for task, recipe, algo in product(PRINTED, ("robust", "paper"), ("ddpg", "ppo")):
         of_recipe = runs[(runs.task == task) & (runs.variant == "") & (runs.algo == algo)]
         part = of_column(main_group(task, of_recipe, recipe), best_column(task)._replace(algo=algo))
         histories, cells = [run.progress for run in part.curves], []
@@ -315,7 +316,7 @@ def cost_lines(runs):
 def pid_lines(runs):
     """The demonstrator in the test study and in other ones."""
     lines = [["task", "", *METRICS["test"], "steps"]]
-    for run in runs[runs.algo == "pid"].sort_values(["task", "recipe"]).itertuples():
+    for run in runs[(runs.algo == "pid") & runs.task.isin(PRINTED)].sort_values(["task", "recipe"]).itertuples():
         (printed,) = columns(run.task).query("sweep == 'pid'").to_dict("records")
         if TITLES[run.task] not in [line[0] for line in lines]:
             lines.append([TITLES[run.task], "paper", *(f"{printed[m]:g}" for m in METRICS["test"]), ""])
@@ -327,7 +328,7 @@ def pid_lines(runs):
 
 
 BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
-          for kind in (*METRICS, *COMPARED) for task in TASKS}  # fmt: skip
+          for kind in (*METRICS, *COMPARED) for task in PRINTED}  # fmt: skip
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
     ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines), ("cost", cost_lines),
     ("demonstrator", pid_lines))}  # fmt: skip

@@ -203,7 +203,8 @@ def find_runs(named=None):
             rows[path] = curves.row | {"steps": steps, "finished": steps >= curves.row["total_env_steps"],
                                        "own": not path.is_relative_to(RESULTS.resolve()), "curves": curves}  # fmt: skip
     names = ["task", *GROUP, *COLUMN[1:], "K", "recorded", "seed", "commit", "steps", "finished", "own", "curves"]
-    runs = pd.DataFrame(rows.values(), columns=names).astype({"finished": bool, "own": bool})
+    types = {"finished": bool, "own": bool, "num_demos": int, "lambda_bc": float}
+    runs = pd.DataFrame(rows.values(), columns=names).astype(types)
     runs = runs.sort_values(["finished", "steps", "own"], ascending=False, kind="stable")
     for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
         kept, *others = twins.itertuples()
@@ -241,11 +242,12 @@ def columns(task, runs=None):
     training, test = printed
     found = training.merge(test.drop(columns=COLUMN[1:]), on=["sweep", "value"], how="left")
     found = pd.concat([found, test[test.sweep == "pid"].assign(algo="pid", num_demos=0, lambda_bc=0.0)])
+    found = found.drop(columns="value").astype({"num_demos": int, "lambda_bc": float})
     if runs is not None:
         ours = runs[COLUMN].drop_duplicates().merge(found[COLUMN].drop_duplicates(), how="left", indicator="where")
         ours = ours[ours["where"] == "left_only"].drop(columns="where").sort_values(COLUMN)
         found = pd.concat([found, ours.assign(sweep="other")])
-    return found.drop(columns="value").astype({"num_demos": int}).reset_index(drop=True)
+    return found.reset_index(drop=True)
 
 
 def of_column(runs, column):
@@ -253,9 +255,11 @@ def of_column(runs, column):
     return runs[(runs[COLUMN] == [column.algo, column.num_demos, column.lambda_bc]).all(axis=1)]
 
 
-def best_column(task):
-    """The printed column with the highest R90, a row as `itertuples` gives it."""
-    return next(columns(task).nlargest(1, "R90").itertuples())
+def best_column(task, runs=None):
+    """The printed column with the highest R90, a row as `itertuples` gives it. Of a task that the paper does not have,
+    the column of `runs` with most demonstrations, None where there is none."""
+    found = columns(task, runs).sort_values(["R90", "num_demos"], ascending=False, kind="stable")
+    return next(found.itertuples(), None)
 
 
 # ---- metrics ---------------------------------------------------------------------------------------------------------

@@ -429,6 +429,21 @@ def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstr
     assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 6
 
 
+def test_a_task_that_the_paper_does_not_have_has_tables_and_figures_too(tmp_path, monkeypatch):
+    for names in (tables.TASKS, tables.INDEX):  # as whoever adds one does, by the remark at kinova_env.TASKS
+        monkeypatch.setitem(names, "push", names["p2p"])
+    for names, name in ((tables.TITLES, "Push"), *((numbers, "ours") for numbers in tables.NUMBERS.values())):
+        monkeypatch.setitem(names, "push", name)
+    assert not plot_curves.save_figures(tmp_path, tables.find_runs()[0], Flags(), [".png"])[:-2]
+    write_run(tmp_path / "runs/a", success=(1, 1), task="push")
+    write_run(tmp_path / "runs/b", success=(1, 0), task="push", num_demos=0, lambda_bc=0)
+    runs, _ = tables.find_runs()
+    assert [cell(table(task="push"), "R90", "other", *of).get("seeds") for of in ((100, 1.8), (0, 0))] == [1, 1]
+    assert "50.0" in tables.make_table("test", "push", runs)[0]
+    names = plot_curves.save_figures(tmp_path, runs, Flags(), [".png"])
+    assert {"fig-learning-push", "fig-success-push", "fig-error-push", "fig-trajectories-push"} <= set(names)
+
+
 def test_runs_named_with_runs_are_all_drawn_whatever_their_flags(tmp_path):
     for i, variant in enumerate(("", "n_step=1")):
         write_run(tmp_path / f"x/{i}", success=(1, 1), variant=variant)
