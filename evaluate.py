@@ -113,11 +113,12 @@ class Policy:
 
 
 def pack_policy(flags, net, output):
-    """What policy.pt holds of an ActorCritic: see Policy. Its normalisation is folded into the first layer."""
+    """What policy.pt holds of an ActorCritic: see Policy. DDPG's normalisation is folded into the first layer."""
     weights = {name: w.detach().cpu().clone() for name, w in net.mu_net.state_dict().items()}
-    of_s = weights["0.weight"][:, : OBS_DIM[flags.task]]  # a view: without the input of --grasp_input
-    of_s /= net.s_std.cpu()
-    weights["0.bias"] -= of_s @ net.s_mean.cpu()
+    if hasattr(net, "s_mean"):
+        of_s = weights["0.weight"][:, : OBS_DIM[flags.task]]  # a view: without the input of --grasp_input
+        of_s /= net.s_std.cpu()
+        weights["0.bias"] -= of_s @ net.s_mean.cpu()
     sizes = [net.mu_net[0].in_features, *flags.hidden_sizes, 4]
     return {"task": flags.task, "symmetry": flags.symmetry, "sizes": sizes, "output": output, "weights": weights,
             "grasp_input": flags.grasp_input}  # fmt: skip

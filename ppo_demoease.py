@@ -54,9 +54,9 @@ class Flags(logx.RunFlags):
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
     demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch; N_demos / 5, robust: N_demos", low=1)
-    train_iters: int | None = flag(None, "N_up, updates an epoch; 20, robust: 80", low=1)
+    train_iters: int = flag(20, "N_up, updates an epoch", low=1)
     batch_size: int = flag(800, "of B_o", low=1)
-    demo_batch_size: int | None = flag(None, "of B_d; 100, robust: 256", low=1)
+    demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
     lam: float = flag(0.97, "gamma^GAE, of the advantage estimates", low=0, high=1)
     clip_ratio: float = flag(0.2, "epsilon", low=0)
@@ -65,13 +65,12 @@ class Flags(logx.RunFlags):
     vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
-    mask: str | None = flag(None, "reward: V(s) < R(s, a), Eq. 9; return: V(s) < the demonstrated reward-to-go; "
-                            "none: M = 1 (robust)", ("reward", "return", "none"))  # fmt: skip
+    mask: str = flag("reward", "reward: V(s) < R(s, a), Eq. 9; return: V(s) < the demonstrated reward-to-go; "
+                     "none: M = 1", ("reward", "return", "none"))  # fmt: skip
     demos_in_B_o: bool | None = flag(None, "demonstrations go into B_o too (Alg. 2); robust: no")
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
     clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 4000", low=0)
-    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of the first B_d; robust: yes")
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
@@ -80,12 +79,10 @@ TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
     "p2po": dict(num_demos=250, lambda_bc=2.0, hidden_sizes=(256, 1024, 256)),
     "pnp": dict(num_demos=400, lambda_bc=15.0, hidden_sizes=(512, 512, 256)),
 }
-PAPER = dict(symmetry="gas", gains="authors", train_iters=20, demo_batch_size=100, pi_lr=3e-4, log_std=-0.5,
-             mask="reward", demos_in_B_o=True, demo_noise=0.0, clone_iters=0, normalize_obs=False,
-             grasp_input=False)  # fmt: skip
-ROBUST = dict(symmetry="mirror", gains="fast", train_iters=80, demo_batch_size=256, pi_lr=3e-6, log_std=-2.0,
-              mask="none", demos_in_B_o=False, demo_noise=0.2, clone_iters=4000, normalize_obs=True,
-              grasp_input=True)  # fmt: skip
+PAPER = dict(symmetry="gas", gains="authors", pi_lr=3e-4, log_std=-0.5, demos_in_B_o=True, demo_noise=0.0,
+             clone_iters=0, grasp_input=False)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-6, log_std=-2.0, demos_in_B_o=False, demo_noise=0.2,
+              clone_iters=4000, grasp_input=True)  # fmt: skip
 
 
 def recipe_defaults(task, recipe, num_demos=None):
@@ -180,8 +177,8 @@ def mlp(sizes):
 
 
 class ActorCritic(nn.Module):
-    """pi_omega: s -> N(mu, sigma), sigma the same in every state, and V_nu: s -> R, on (s - s_mean) / s_std, and with
-    grasp_input on 1 where the cube is grasped, else 0."""
+    """pi_omega: s -> N(mu, sigma), sigma the same in every state, and V_nu: s -> R; with grasp_input they have one more
+    input, 1 where the cube is grasped, else 0."""
 
     def __init__(self, obs_dim, hidden_sizes, log_std, grasp_input):
         super().__init__()
@@ -189,12 +186,9 @@ class ActorCritic(nn.Module):
         self.mu_net = mlp([obs_dim + grasp_input, *hidden_sizes, 4])
         self.v_net = mlp([obs_dim + grasp_input, *hidden_sizes, 1])
         self.log_std = nn.Parameter(torch.full((4,), log_std))
-        self.register_buffer("s_mean", torch.zeros(obs_dim))
-        self.register_buffer("s_std", torch.ones(obs_dim))
 
     def inputs(self, s):
-        x = (s - self.s_mean) / self.s_std
-        return torch.cat((x, grasped(s).unsqueeze(-1).float()), dim=-1) if self.grasp_input else x
+        return torch.cat((s, grasped(s).unsqueeze(-1).float()), dim=-1) if self.grasp_input else s
 
     def mu(self, s):
         """The mean action of s (n, obs_dim): (n, 4), not bounded."""
@@ -279,13 +273,9 @@ class Learner:
         return [x.to(self.flags.device) for x in (s, a, r, R_demo[i])]
 
     def clone(self, B_d, R_demo):
-        """Before the first step: observations are normalised by B_d, then clone_iters updates on B_d alone, L_BC with
-        M = 1 for the actor, L_C on the demonstrated rewards-to-go."""
+        """Before the first step: clone_iters updates on B_d alone, L_BC with M = 1 for the actor, L_C on the
+        demonstrated rewards-to-go."""
         f, net = self.flags, self.net
-        if f.normalize_obs:
-            s = B_d.columns()[0]
-            net.s_mean.copy_(s.mean(0))
-            net.s_std.copy_(s.std(0).clamp(min=0.2))  # less would blow up what the demonstrations hardly show
         optimizer = self.adam(f.vf_lr, f.vf_lr)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):

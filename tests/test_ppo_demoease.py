@@ -136,7 +136,6 @@ class Paper:
 
     def __init__(self, learner, compare="reward"):
         self.f, self.compare = learner.flags, compare
-        self.mean, self.std = learner.net.s_mean.clone(), learner.net.s_std.clone()
 
         def copy_of(source):
             layers = []
@@ -153,11 +152,11 @@ class Paper:
                                      (self.omega, self.f.pi_lr), (self.nu, self.f.vf_lr)))  # fmt: skip
 
     def inputs(self, s):
-        x = [(s - self.mean) / self.std]
-        if self.mu[0].in_features == 26:  # the 26th says whether the cube is where the TCP is
-            P_e = s[:, 16:19] - s[:, 19:22]
-            x.append(torch.tensor([[float(torch.dist(a, b) < 1e-3)] for a, b in zip(P_e, s[:, 22:], strict=True)]))
-        return torch.cat(x, 1)
+        if self.mu[0].in_features < 26:
+            return s
+        P_e = s[:, 16:19] - s[:, 19:22]  # the 26th says whether the cube is where the TCP is
+        held = [[float(torch.dist(a, b) < 1e-3)] for a, b in zip(P_e, s[:, 22:], strict=True)]
+        return torch.cat((s, torch.tensor(held)), 1)
 
     def pi(self, s):
         return Normal(self.mu(self.inputs(s)), torch.exp(self.log_std))
@@ -238,8 +237,6 @@ def test_an_epoch_is_that_of_a_plain_reimplementation_of_the_paper(task, compare
     learner = ppo.Learner(resolve(task=task, mask=compare, target_kl=target_kl, grasp_input=task == "pnp", **SETTINGS))
     with torch.no_grad():
         learner.net.v_net[-1].weight.mul_(60)  # values on both sides of the rewards
-        learner.net.s_mean.uniform_(-0.3, 0.3)
-        learner.net.s_std.uniform_(0.6, 1.5)
     paper = Paper(learner, compare)
     found = [*trajectories(["true", "timeout"], obs_dim, 3, own=0), *trajectories(ENDS, obs_dim, 4)]
     demos = trajectories(["true", "true", "timeout", "true", "timeout", "true"], obs_dim, 7, own=0)
@@ -339,36 +336,13 @@ def test_the_mask_picks_the_rows_whose_state_is_worth_less_than_the_threshold():
 # ---- before the first step -------------------------------------------------------------------------------------------
 
 
-def wide_demos():
-    """Demonstrations of states with unlike means and deviations, one of which never changes."""
-    demos = trajectories(ENDS, seed=8, own=0)
-    scale, shift = torch.logspace(-1, 1, 22), torch.linspace(-3, 3, 22)
-    scale[5] = 0
-    for x in demos:
-        x.s = shift + scale * x.s
-    return demos
-
-
-def test_normalisation_is_by_mean_and_deviation_of_the_demonstrated_states_or_a_fifth():
-    demos = wide_demos()
-    s, B_d = flat(demos, "s"), buffer_of(demos)
-    learner, _ = a_learner(normalize_obs=True)
-    learner.clone(B_d, rewards_to_go(demos))
-    seen, std = learner.net.inputs(s), s.std(0)
-    assert 3 < (std > 0.2).sum() < 22  # both cases
-    torch.testing.assert_close(seen.mean(0), torch.zeros(22), rtol=0, atol=1e-4)
-    torch.testing.assert_close(seen.std(0), torch.where(std > 0.2, 1.0, std / 0.2), rtol=1e-4, atol=1e-6)
-
-
 @pytest.mark.parametrize("task, grasp_input", [("p2p", False), ("pnp", True)])
-def test_the_saved_policy_has_the_normalisation_folded_in(task, grasp_input):
+def test_the_saved_policy_is_the_mean_action_clipped(task, grasp_input):
     torch.manual_seed(0)
     s = torch.from_numpy(states(200, ppo.OBS_DIM[task]))
     if grasp_input:  # in half of the states the cube is grasped
         s[::2, 22:] = s[::2, 16:19] - s[::2, 19:22]
     learner = ppo.Learner(resolve(task=task, grasp_input=grasp_input, hidden_sizes=(16, 16)))
-    learner.net.s_mean.uniform_(-2, 2)
-    learner.net.s_std.uniform_(0.2, 3)
     policy = evaluate.Policy(learner.policy())
     with torch.no_grad():
         acting = learner.net.mu(s).clamp(-1, 1)
@@ -522,12 +496,11 @@ def test_demonstrations_open_the_early_epochs_until_B_d_is_full(flags, filled, w
     torch.testing.assert_close(epochs[0].R_demo, torch.tensor(R), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("part", [dict(normalize_obs=True), dict(clone_iters=3)], ids=lambda part: next(iter(part)))
-def test_normalisation_and_cloning_come_before_the_first_step_from_the_first_B_d(part, world, epochs, monkeypatch):
+def test_cloning_comes_before_the_first_step_from_the_first_B_d(world, epochs, monkeypatch):
     seen, clone = [], ppo.Learner.clone
     monkeypatch.setattr(ppo.Learner, "clone", lambda self, B_d, R: seen.append(B_d.filled) or clone(self, B_d, R))
     plain = world("plain", epochs=1, demos_per_epoch=2, **DEMONSTRATED)
-    run = world("a", epochs=1, demos_per_epoch=2, **DEMONSTRATED | part)
+    run = world("a", epochs=1, demos_per_epoch=2, clone_iters=3, **DEMONSTRATED)
     assert seen == [LENGTHS[1]] * 2 and not np.array_equal(run.steps[0].a, plain.steps[0].a)
 
 

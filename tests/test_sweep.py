@@ -134,14 +134,14 @@ def test_columns_that_vary_makes_the_same_are_one_run():
 
 
 def test_varied_values_are_written_as_in_the_names_of_folders():
-    vary = ["hidden_sizes=64x32,8", "normalize_obs=True,False", "demos_in_B_o=False,True"]
+    vary = ["hidden_sizes=64x32,8", "grasp_input=True,False", "demos_in_B_o=False,True"]
     jobs = jobs_of("--task", "pnp", "--columns", "baseline", "--vary", *vary, "--seeds", 1)
     assert len(jobs) == 8
     assert " ".join(jobs[0].words).endswith(
-        "--hidden_sizes 64 32 --normalize_obs --no-demos_in_B_o --data_dir data/runs --seed 0")  # fmt: skip
+        "--hidden_sizes 64 32 --grasp_input --no-demos_in_B_o --data_dir data/runs --seed 0")  # fmt: skip
     assert " ".join(jobs[7].words).endswith(
-        "--hidden_sizes 8 --no-normalize_obs --demos_in_B_o --data_dir data/runs --seed 0")  # fmt: skip
-    assert "hidden_sizes=64x32-demos_in_B_o=False-normalize_obs=True" in jobs[0].folder.name
+        "--hidden_sizes 8 --no-grasp_input --demos_in_B_o --data_dir data/runs --seed 0")  # fmt: skip
+    assert "hidden_sizes=64x32-demos_in_B_o=False-grasp_input=True" in jobs[0].folder.name
 
 
 @pytest.mark.parametrize("flags, says", [
