@@ -70,7 +70,7 @@ class Flags(logx.RunFlags):
     demos_in_B_o: bool | None = flag(None, "demonstrations go into B_o too (Alg. 2); robust: no")
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
-    clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 4000", low=0)
+    clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 10000", low=0)
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
@@ -82,7 +82,7 @@ TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
 PAPER = dict(symmetry="gas", gains="authors", pi_lr=3e-4, log_std=-0.5, demos_in_B_o=True, demo_noise=0.0,
              clone_iters=0, grasp_input=False)  # fmt: skip
 ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-6, log_std=-2.0, demos_in_B_o=False, demo_noise=0.2,
-              clone_iters=4000, grasp_input=True)  # fmt: skip
+              clone_iters=10_000, grasp_input=True)  # fmt: skip
 
 
 def recipe_defaults(task, recipe, num_demos=None):
