@@ -7,9 +7,9 @@
 
 `--recipe paper`, the default, is the algorithm as published (Table 2); where
 table and algorithm are silent, the values are Spinning Up's. `--recipe robust`
-adds a few parts, each a flag of its own. What they reach, in how many minutes,
-with how many seeds: data/results/README.md. Differences from the paper:
-DIFFERENCES.md. A run is a folder, DATA_DIR/NAME (logx.py).
+changes a few things, each a flag of its own. What they reach, in how many
+minutes, with how many seeds: data/results/README.md. Differences from the
+paper: DIFFERENCES.md. A run is a folder, DATA_DIR/NAME (logx.py).
 """
 
 import math
@@ -54,7 +54,7 @@ class Flags(logx.RunFlags):
     max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
     demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch; N_demos / 5, robust: N_demos", low=1)
-    train_iters: int = flag(20, "N_up, updates an epoch", low=1)
+    train_iters: int = flag(20, "N_up, updates an epoch at most", low=1)
     batch_size: int = flag(800, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
@@ -65,8 +65,7 @@ class Flags(logx.RunFlags):
     vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
     hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
-    mask: str = flag("reward", "reward: V(s) < R(s, a), Eq. 9; return: V(s) < the demonstrated reward-to-go; "
-                     "none: M = 1", ("reward", "return", "none"))  # fmt: skip
+    mask: str = flag("reward", "reward: Eq. 9; none: M = 1", ("reward", "none"))
     demos_in_B_o: bool | None = flag(None, "demonstrations go into B_o too (Alg. 2); robust: no")
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
@@ -101,7 +100,7 @@ def resolve(flags):
     flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.num_demos), "ppo")
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
-    if flags.demos_in_B_o and flags.demo_noise and flags.demos is None:
+    if flags.demos_in_B_o and flags.demo_noise:
         raise logx.BadInput("--demos_in_B_o: B_o would not hold what was done where demonstrations are recorded with "
                             "noise; use --no-demos_in_B_o or --demo_noise 0")  # fmt: skip
     return flags
@@ -157,11 +156,11 @@ def advantages(r, end, V, last_V, gamma, lam):
 
 
 def demonstrated_rows(demos, f):
-    """Rows of a TrajectoryBuffer, (M, width): the demonstrations, with the action that the demonstrator asked for."""
-    n = len(demos["rew"]) if demos else 0
-    B = TrajectoryBuffer(OBS_DIM[f.task], n, f.symmetry)
-    names = ("obs", "act", "rew", "obs2", "terminated", "truncated")
-    for s, a, r, s2, terminated, truncated in zip(*(demos[name] for name in names), strict=True) if demos else ():
+    """Rows of a TrajectoryBuffer, (M, width): the demonstrations, with the action that the demonstrator asked for; with
+    --demo_noise another one was done, and r and s' are of that."""
+    columns = [demos[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated")] if demos else [[]] * 6
+    B = TrajectoryBuffer(OBS_DIM[f.task], len(columns[0]), f.symmetry)
+    for s, a, r, s2, terminated, truncated in zip(*columns, strict=True):
         B.store(s, a, r, s2, terminated, terminated or truncated, own=False)
     return B.rows
 
@@ -222,9 +221,9 @@ def loss_O(ratio, A, clip_ratio):
     return -torch.min(ratio * A, ratio.clamp(1 - clip_ratio, 1 + clip_ratio) * A).mean()
 
 
-def mask(V_demo, threshold):
-    """M_t, Eq. 9: 1 where the demonstrated reward (ours: reward-to-go) is greater than the value of the state."""
-    return (V_demo < threshold).float()
+def mask(V_demo, r_demo):
+    """M_t, Eq. 9: 1 where the demonstrated reward is greater than the value of the state."""
+    return (V_demo < r_demo).float()
 
 
 def loss_BC(a_demo, a_hat, M):
@@ -262,32 +261,35 @@ class Learner:
         mu = self.net.mu(torch.from_numpy(s).to(self.flags.device))
         return mu.cpu().numpy(), self.net.log_std.exp().cpu().numpy()
 
-    def demo_batch(self, B_d, R_demo):
-        """A batch of B_d: s (n, obs_dim), a (n, 4), r and reward-to-go (n,)."""
+    def demo_batch(self, B_d):
+        """Rows i (n,) of B_d, drawn at random, with their s (n, obs_dim), a (n, 4), r (n,)."""
         i = torch.randint(B_d.filled, (min(self.flags.demo_batch_size, B_d.filled),))
         angle = 2 * math.pi * torch.rand(len(i)) if self.flags.symmetry == "so2" else None
         s, a, r, *_ = B_d.columns(i, angle)
         if self.flags.symmetry == "mirror":
             half = slice(None, None, 2)  # rows are drawn at random: this half of them is a random one
             s[half], a[half] = gas.mirror(s[half], a[half])
-        return [x.to(self.flags.device) for x in (s, a, r, R_demo[i])]
+        return i, *(x.to(self.flags.device) for x in (s, a, r))
 
-    def clone(self, B_d, R_demo):
+    def clone(self, B_d):
         """Before the first step: clone_iters updates on B_d alone, L_BC with M = 1 for the actor, L_C on the
-        demonstrated rewards-to-go."""
+        demonstrated rewards-to-go for the critic, both at the critic's rate, which falls to 0 (a cosine)."""
         f, net = self.flags, self.net
+        _, _, r, _, _, end, _ = B_d.columns()
+        R = discounted_sum(r, end, torch.zeros_like(end), f.gamma)  # no V yet: nothing follows a timeout
         optimizer = self.adam(f.vf_lr, f.vf_lr)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
-            s, a, _, R = self.demo_batch(B_d, R_demo)
-            loss = loss_BC(a, net.mu(s), torch.ones_like(R)) + loss_C(net.V(s), R)
+            i, s, a, r = self.demo_batch(B_d)
+            loss = loss_BC(a, net.mu(s), torch.ones_like(r)) + loss_C(net.V(s), R[i].to(f.device))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             decay.step()
 
-    def updates(self, B_o, B_d, R_demo):
-        """The N_up updates of an epoch (B_d empty: no cloning). Returns {name: float}, means over them."""
+    def updates(self, B_o, B_d):
+        """The N_up updates of an epoch (B_d empty: no cloning). Returns {name: float}, means over them; None where
+        target_kl let none through."""
         f, net = self.flags, self.net
         angle = None
         if f.symmetry == "so2":  # each trajectory turned by an angle of its own, as if it had been lived there
@@ -307,8 +309,8 @@ class Learner:
             i = torch.randint(len(s), (min(f.batch_size, len(s)),)).to(f.device)
             mu, own_i = net.mu(s[i]), own[i] > 0
             with torch.no_grad():
-                D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), net.pi(mu))[own_i].mean()  # NaN without own ones
-            if f.target_kl <= D_KL:
+                D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), net.pi(mu))[own_i].mean()
+            if f.target_kl <= D_KL:  # not where it is NaN, without own ones
                 break
             V_s = net.V(s[i])
             L_C = loss_C(V_s, R[i])
@@ -316,11 +318,10 @@ class Learner:
             L_A = L_O = loss_O(ratio, A[i], f.clip_ratio)
             L_BC = M = bc_relative_error = mean_action_demo = L_C.new_full((), math.nan)
             if B_d.filled:
-                s_demo, a_demo, r_demo, R_demo_i = self.demo_batch(B_d, R_demo)
+                _, s_demo, a_demo, r_demo = self.demo_batch(B_d)
                 a_hat = net.mu(s_demo)
                 with torch.no_grad():
-                    threshold = {"reward": r_demo, "return": R_demo_i, "none": torch.inf}[f.mask]
-                    M = mask(net.V(s_demo), threshold)
+                    M = mask(net.V(s_demo), r_demo) if f.mask == "reward" else torch.ones_like(r_demo)
                 L_BC = loss_BC(a_demo, a_hat, M)
                 L_A = loss_A(L_O, L_BC, f.lambda_bc)
                 mean_action_demo = a_hat.abs().mean()
@@ -378,10 +379,9 @@ def loop(f, run):
     state = run.checkpoint
     demo_rows = state["demo_rows"] if state else demonstrated_rows(demos, f)
     ends = [0, *(1 + torch.nonzero(demo_rows[:, -2]).flatten()).tolist()]  # of demonstration n: rows ends[n] ...
-    B_o, B_d = (TrajectoryBuffer(OBS_DIM[f.task], n, f.symmetry) for n in (f.steps_per_epoch + len(demo_rows), 0))
-    B_d.rows = demo_rows  # there from the start, and "filled" as the epochs open with them
-    _, _, r_demo, _, _, end, _ = B_d.columns(slice(None))
-    R_demo = discounted_sum(r_demo, end, torch.zeros_like(end), f.gamma)  # no V yet: nothing follows a timeout
+    B_o = TrajectoryBuffer(OBS_DIM[f.task], f.steps_per_epoch + len(demo_rows), f.symmetry)
+    B_d = TrajectoryBuffer(OBS_DIM[f.task], 0, f.symmetry)
+    B_d.rows = demo_rows  # all of them; filled counts those that were shown so far
 
     def open_epoch(shown):
         """Demonstrations, until B_d is full (Alg. 2); shown: how many it held. Returns how many it holds."""
@@ -401,8 +401,8 @@ def loop(f, run):
     else:
         t, (s, _), shown = 0, env.reset(), open_epoch(0)
     run.begin(demo_env_steps)
-    if not state and B_d.filled:
-        learner.clone(B_d, R_demo)
+    if demos:
+        learner.clone(B_d)
 
     while t < run.total_steps:
         # act
@@ -410,7 +410,7 @@ def loop(f, run):
         a = (mu + sigma * rng.standard_normal(4)).astype(np.float32)
 
         # step, store
-        s, r, terminated, truncated, info = env.step(a)
+        s, _, terminated, truncated, info = env.step(a)
         t += 1
         cut = t % f.steps_per_epoch == 0  # of the trajectory, for the update; the episode goes on
         B_o.store(*env.episode[-1][:4], terminated, terminated or truncated or cut, own=True)
@@ -422,7 +422,7 @@ def loop(f, run):
 
         # update, log
         if cut:
-            if measured := learner.updates(B_o, B_d, R_demo):
+            if measured := learner.updates(B_o, B_d):
                 run.log_updates(measured, learner.net)
             B_o.filled = 0
             shown = open_epoch(shown)

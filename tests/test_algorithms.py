@@ -385,7 +385,7 @@ def learner_and_buffers(script, **changes):
             end = i % 5 == 4
             buffer.store(s, a, rng.normal(), s2, *((0.9 * (not end),) if script is ddpg else (end, end, True)))
         buffers.append(buffer)
-    return learner, (*buffers, 3 if script is ddpg else torch.zeros(40))
+    return learner, (*buffers, 3) if script is ddpg else buffers
 
 
 def weights(learner):
@@ -547,15 +547,11 @@ def test_what_learns_stays_on_the_device_asked(script, monkeypatch):
     )  # "meta" has no fused one
     flags = script.resolve(script.Flags(task="pnp", recipe="robust", hidden_sizes=(8, 8), clone_iters=2, quiet=True))
     learner = script.Learner(replace(flags, device="meta"))
+    B = (ddpg.ReplayBuffer if script is ddpg else ppo.TrajectoryBuffer)(25, 20, "mirror")
+    B.filled = 20
     if script is ddpg:
-        B = script.ReplayBuffer(25, 20, "mirror")
-        B.filled = 20
         assert {x.device.type for x in learner.update(B, B)} == {"meta"}
-        learner.clone(B)
-    else:
-        B = script.TrajectoryBuffer(25, 20, "mirror")
-        B.filled = 20
-        learner.clone(B, torch.zeros(20))
+    learner.clone(B)
     assert {w.device.type for w in learner.net.parameters()} == {"meta"}
 
 
