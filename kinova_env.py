@@ -34,7 +34,7 @@ class Task:
     test_theta: float  # start angle of the test study
 
 
-TASKS = {  # a new one also needs OBSERVATION, TASK_DEFAULTS in the algorithm files, TITLES and NUMBERS in tables.py
+TASKS = {  # a new one also needs OBSERVATION, TASK_DEFAULTS in the algorithm files, TITLES in tables.py
     "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4),
     "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2),
     "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2),

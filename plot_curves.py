@@ -482,8 +482,7 @@ def save_figures(folder, runs, flags, ends, dpi=200):
     names = []
     for task, name in [*product(TASKS, DRAWINGS[:-2]), *product([None], OF_NO_TASK)]:
         recipes = [None]
-        shown = tables.of_task(runs, task, variants=bool(flags.runs))
-        if name in ("learning", "error") and len(shown):
+        if name in ("learning", "error") and len(shown := tables.of_task(runs, task, variants=bool(flags.runs))):
             of_paper = shown[shown.algo == tables.best_column(task, shown).algo].recipe
             recipes += sorted(set(of_paper) - set(main_group(task, shown).recipe))
         for recipe in recipes:

@@ -29,6 +29,7 @@ from tables import (
     GROUP,
     HERE,
     METRICS,
+    NUMBERS,
     TITLES,
     best_column,
     between,
@@ -41,7 +42,7 @@ from tables import (
 )
 
 TRIALS = 500  # of the test study
-PRINTED = [task for task in TASKS if len(columns(task))]  # a task that the paper does not have is on no page
+PRINTED = tuple(NUMBERS["training"])  # a task that the paper does not have is on no page
 PAGES = (HERE / "README.md", HERE / "DIFFERENCES.md", HERE / "data/results/README.md")
 INDEX_COLUMNS = ["name", "task", *GROUP[:-1], "num_demos", "lambda_bc", "seed", "env_steps", "finished", "eval_success",
          "P_scs_percent", "git_commit"]  # fmt: skip
@@ -289,13 +290,12 @@ def mean_of_tenth(values, share):
     return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
 
 
-def study(run):
-    """What a run, a row of tables.find_runs, is there for."""
+def study(run, printed):
+    """What a run, a row of tables.find_runs, is there for. printed: [N_demos, lambda_BC] of its task's columns."""
     if run.recipe not in tables.OWN_SYMMETRY:
         return "other libraries"
     if run.recipe == "paper":
         return "as published"
-    printed = columns(run.task)[COLUMN[1:]].values.tolist()
     if run.symmetry != tables.OWN_SYMMETRY[run.recipe] or [run.num_demos, run.lambda_bc] not in printed:
         return "robust, symmetries and K"
     return "robust, ablations" if run.variant or not run.curves.own_length else "robust, the paper's columns"
@@ -304,7 +304,8 @@ def study(run):
 def cost_lines(runs):
     """What the published runs took on one core, validation trials included, the test study not."""
     trained = runs[runs.algo != "pid"]
-    trained = trained.assign(study=[study(run) for run in trained.itertuples()],
+    printed = {task: columns(task)[COLUMN[1:]].values.tolist() for task in trained.task.unique()}
+    trained = trained.assign(study=[study(run, printed[run.task]) for run in trained.itertuples()],
                              hours=[run.progress.seconds.max() / 3600 for run in trained.curves])  # fmt: skip
     lines = [["what for", "task", "algorithm", "runs", "environment steps", "core-hours"]]
     for (what, task, algo), part in [*trained.groupby(["study", "task", "algo"]), (("all", "", ""), trained)]:

@@ -90,7 +90,7 @@ class Job:
     total: int
     words: tuple = ()  # script and flags
     kind: tuple = ()
-    clone_iters: int = 0
+    clone_iters: int = 0  # none without demonstrations
 
     @property
     def command(self):
@@ -208,7 +208,8 @@ def grid(flags):
                     command = (f"{SCRIPTS[algo]}.py", *words, "--seed", f"{seed}")
                     kind = (algo, task, f.recipe, f.variant, bool(f.num_demos))
                     folder = flags.data_dir / f.name
-                    jobs[folder] = Job(folder, f.epochs * f.steps_per_epoch, command, kind, f.clone_iters)
+                    total, clone_iters = f.epochs * f.steps_per_epoch, f.clone_iters * bool(f.num_demos)
+                    jobs[folder] = Job(folder, total, command, kind, clone_iters)
             except logx.BadInput as error:
                 raise logx.BadInput(f"{SCRIPTS[algo]}.py: {error}") from None
     return list(jobs.values())
@@ -218,7 +219,8 @@ def costs(jobs):
     """{job: seconds to come}, cloning and updates included, by a short run of the same kind here, alone."""
     measured = {}
     for kind, job in tqdm({job.kind: job for job in jobs}.items(), "measuring", leave=False, disable=None):
-        (algo, *_, demos), clone_iters = kind, min(job.clone_iters, 200)
+        algo, *_, demos = kind
+        clone_iters = min(job.clone_iters, 200)
         short = ["--epochs", "2", "--eval_every", "0", "--num_demos", "4" if demos else "0"]
         short += ["--clone_iters", f"{clone_iters}"] * bool(clone_iters)
         short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []

@@ -469,7 +469,7 @@ def make_table(kind, task, runs, variants=False):
     if kind in METRICS:
         rows = table(kind, task, of_task(runs, task, variants))
         lines, notes, rows = table_lines(kind, rows), table_notes(kind, rows), rows.drop(columns="values")
-        title = f"{TITLES[task]}, {kind} metrics: {NUMBERS[kind][task]}, and ours"
+        title = f"{TITLES[task]}, {kind} metrics: {NUMBERS[kind].get(task, 'no table of the paper')}, and ours"
     else:
         lines = compared_lines(kind, of_task(runs, task, variants=True))
         base = {"ablations": "the recipe", "symmetries": "no symmetry", "partitions": "K = 4"}[kind]
