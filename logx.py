@@ -42,7 +42,7 @@ from tqdm import tqdm
 EPISODES = ["episode", "env_steps", "return", "length", "success", "collision"]
 PROGRESS = ["epoch", "env_steps", "demo_env_steps", "seconds", "EpRet", "EpLen", "Success"]  # then what is measured,
 EVALUATED = ["eval_success", "eval_return"]  # and the validation trials
-FORMAT = 4  # of a checkpoint: raised where older ones cannot go on
+FORMAT = 5  # of a checkpoint: raised where older ones cannot go on
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is what Slurm sends before the time is up
 
 

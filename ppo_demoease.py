@@ -6,10 +6,10 @@
     python ppo_demoease.py --seed 1 --resume                # where it stopped
 
 `--recipe paper`, the default, is the algorithm as published (Table 2); where
-table and algorithm are silent, the values are Spinning Up's. `--recipe robust`
-changes a few things, each a flag of its own. What they reach, in how many
-minutes, with how many seeds: data/results/README.md. Differences from the
-paper: DIFFERENCES.md. A run is a folder, DATA_DIR/NAME (logx.py).
+table and algorithm are silent, the values are Spinning Up's or, where
+DIFFERENCES.md says so, ours. `--recipe robust` changes a few things, each a flag
+of its own. What they reach, in how many minutes, with how many seeds:
+data/results/README.md. A run is a folder, DATA_DIR/NAME (logx.py).
 """
 
 import math
@@ -58,9 +58,9 @@ class Flags(logx.RunFlags):
     batch_size: int = flag(800, "of B_o", low=1)
     demo_batch_size: int = flag(100, "of B_d", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    lam: float = flag(0.97, "gamma^GAE, of the advantage estimates", low=0, high=1)
+    lam: float = flag(0.97, "of the advantage estimates: lambda in Alg. 2, gamma^GAE in Table 2", low=0, high=1)
     clip_ratio: float = flag(0.2, "epsilon", low=0)
-    target_kl: float = flag(0.02, "largest D_KL from the policy that acted, on its own samples", low=0)
+    target_kl: float = flag(0.02, "D_KL from the policy that acted, on own samples, that ends the updates", low=0)
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
@@ -112,7 +112,8 @@ def resolve(flags):
 class TrajectoryBuffer:
     """Transitions (s, a, r, s', zeta, end, own), one row each, in the order they were lived.
 
-    end is 1 where the next row is not what came next (true ends, timeouts, cuts); own is 0 for the demonstrator's.
+    zeta is 1 at a true end only; end is 1 on a trajectory's last row: there, at a timeout, where a demonstration leaves
+    its sector, and where an epoch cuts it; own is 0 for the demonstrator's.
     """
 
     def __init__(self, obs_dim, size, symmetry):
@@ -131,7 +132,8 @@ class TrajectoryBuffer:
         self.filled += len(rows)
 
     def columns(self, i=None, angle=None):
-        """s, a, r, s', zeta, end, own of the rows i (all), each turned by its angle: (n, width), or (n,) for 1."""
+        """s, a, r, s', zeta, end, own of the rows i (all), each turned by its angle: (n, width), (n,) where
+        that is 1."""
         rows = self.rows[: self.filled] if i is None else self.rows[i]
         s, a, r, s2, *rest = (x.squeeze(1) if x.shape[1] == 1 else x for x in rows.split(self.widths, dim=1))
         if angle is not None:
@@ -140,7 +142,7 @@ class TrajectoryBuffer:
 
 
 def discounted_sum(x, end, last, discount):
-    """x of each row and what follows in its trajectory, discounted, at whose end `last` follows. All (M,)."""
+    """y_t = x_t + discount y_{t+1}, on a trajectory's last row x_t + discount last_t. All (M,)."""
     total, out = 0.0, []
     for x_t, ends, after in zip(*(column.flip(0).tolist() for column in (x, end, last)), strict=True):
         total = x_t + discount * (after if ends else total)
@@ -155,14 +157,15 @@ def advantages(r, end, V, last_V, gamma, lam):
     return (A - A.mean()) / A.std(correction=0).clamp(min=1e-8)
 
 
-def demonstrated_rows(demos, f):
-    """Rows of a TrajectoryBuffer, (M, width): the demonstrations, with the action that the demonstrator asked for; with
-    --demo_noise another one was done, and r and s' are of that."""
+def demonstration_buffer(demos, f):
+    """B_d with room for all demonstrations, which lie in its rows, none shown yet (`filled` is 0). Their action is what
+    the demonstrator asked for; with --demo_noise another one was done, and r and s' are of that."""
     columns = [demos[name] for name in ("obs", "act", "rew", "obs2", "terminated", "truncated")] if demos else [[]] * 6
     B = TrajectoryBuffer(OBS_DIM[f.task], len(columns[0]), f.symmetry)
     for s, a, r, s2, terminated, truncated in zip(*columns, strict=True):
         B.store(s, a, r, s2, terminated, terminated or truncated, own=False)
-    return B.rows
+    B.filled = 0
+    return B
 
 
 # ---- networks --------------------------------------------------------------------------------------------------------
@@ -197,9 +200,9 @@ class ActorCritic(nn.Module):
         """V_nu of s (n, obs_dim): (n,)."""
         return self.v_net(self.inputs(s)).squeeze(-1)
 
-    def pi(self, mu):
-        """pi_omega(.|s), a distribution, of the means mu (n, 4)."""
-        return gaussian(mu, self.log_std.exp())
+    def pi(self, s):
+        """pi_omega(.|s), a distribution, of s (n, obs_dim)."""
+        return gaussian(self.mu(s), self.log_std.exp())
 
 
 def gaussian(mu, sigma):
@@ -262,7 +265,8 @@ class Learner:
         return mu.cpu().numpy(), self.net.log_std.exp().cpu().numpy()
 
     def demo_batch(self, B_d):
-        """Rows i (n,) of B_d, drawn at random, with their s (n, obs_dim), a (n, 4), r (n,)."""
+        """Rows i (n,) of B_d, drawn at random, and their s (n, obs_dim), a (n, 4), r (n,). so2 turns each at random,
+        mirror reflects half of them."""
         i = torch.randint(B_d.filled, (min(self.flags.demo_batch_size, B_d.filled),))
         angle = 2 * math.pi * torch.rand(len(i)) if self.flags.symmetry == "so2" else None
         s, a, r, *_ = B_d.columns(i, angle)
@@ -275,10 +279,10 @@ class Learner:
         """Before the first step: clone_iters updates on B_d alone, L_BC with M = 1 for the actor, L_C on the
         demonstrated rewards-to-go for the critic, both at the critic's rate, which falls to 0 (a cosine)."""
         f, net = self.flags, self.net
-        _, _, r, _, _, end, _ = B_d.columns()
+        _, _, r, *_, end, _ = B_d.columns()
         R = discounted_sum(r, end, torch.zeros_like(end), f.gamma)  # no V yet: nothing follows a timeout
         optimizer = self.adam(f.vf_lr, f.vf_lr)
-        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
+        decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, f.clone_iters)
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
             i, s, a, r = self.demo_batch(B_d)
             loss = loss_BC(a, net.mu(s), torch.ones_like(r)) + loss_C(net.V(s), R[i].to(f.device))
@@ -288,36 +292,39 @@ class Learner:
             decay.step()
 
     def updates(self, B_o, B_d):
-        """The N_up updates of an epoch (B_d empty: no cloning). Returns {name: float}, means over them; None where
+        """At most N_up updates, an epoch's (B_d empty: no cloning). Returns {name: float}, means over them; None where
         target_kl let none through."""
         f, net = self.flags, self.net
         angle = None
         if f.symmetry == "so2":  # each trajectory turned by an angle of its own, as if it had been lived there
-            trajectory = torch.cat((torch.zeros(1), B_o.columns()[5][:-1])).cumsum(0).long()
+            *_, end, _ = B_o.columns()
+            trajectory = torch.cat((torch.zeros(1), end[:-1])).cumsum(0).long()
             angle = (2 * math.pi * torch.rand(int(trajectory[-1]) + 1))[trajectory]
         s, a, r, s2, zeta, end, own = (x.to(f.device) for x in B_o.columns(angle=angle))
         with torch.no_grad():
             mu_old, sigma_old = net.mu(s), net.log_std.exp()
-            log_prob_old = net.pi(mu_old).log_prob(a)
+            log_prob_old = gaussian(mu_old, sigma_old).log_prob(a)
             V = net.V(s)
             last_V = torch.where(end > 0, (1 - zeta) * net.V(s2), 0.0)  # a timeout is no true end
         R = discounted_sum(r, end, last_V, f.gamma).to(f.device)
         A = advantages(r, end, V, last_V, f.gamma, f.lam).to(f.device)
 
-        measured = []
+        measured, nothing = [], torch.tensor(math.nan)
         for _ in range(f.train_iters):
             i = torch.randint(len(s), (min(f.batch_size, len(s)),)).to(f.device)
-            mu, own_i = net.mu(s[i]), own[i] > 0
+            pi, own_i = net.pi(s[i]), own[i] > 0
             with torch.no_grad():
-                D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), net.pi(mu))[own_i].mean()
-            if f.target_kl <= D_KL:  # not where it is NaN, without own ones
+                D_KL = kl_divergence(gaussian(mu_old[i], sigma_old), pi)[own_i].mean()
+            if f.target_kl <= D_KL:  # NaN, of a batch without own samples, goes on
                 break
             V_s = net.V(s[i])
             L_C = loss_C(V_s, R[i])
-            ratio = (net.pi(mu).log_prob(a[i]) - log_prob_old[i]).exp()
-            L_A = L_O = loss_O(ratio, A[i], f.clip_ratio)
-            L_BC = M = bc_relative_error = mean_action_demo = L_C.new_full((), math.nan)
-            if B_d.filled:
+            ratio = (pi.log_prob(a[i]) - log_prob_old[i]).exp()
+            L_O = loss_O(ratio, A[i], f.clip_ratio)
+            if not B_d.filled:
+                L_A, L_BC = L_O, nothing
+                M = mean_action_demo = bc_relative_error = nothing
+            else:
                 _, s_demo, a_demo, r_demo = self.demo_batch(B_d)
                 a_hat = net.mu(s_demo)
                 with torch.no_grad():
@@ -332,7 +339,7 @@ class Learner:
             self.optimizer.step()
             measured.append([x.detach() for x in (
                 L_O, L_BC, L_C, L_A, M.mean(), V_s.mean(), V_s.max(),
-                mu[own_i].abs().mean(), mean_action_demo, bc_relative_error, D_KL, net.log_std.exp().mean(),
+                pi.mean[own_i].abs().mean(), mean_action_demo, bc_relative_error, D_KL, net.log_std.exp().mean(),
             )])  # fmt: skip
         if not measured:
             return None
@@ -377,31 +384,31 @@ def loop(f, run):
     learner = Learner(f)
 
     state = run.checkpoint
-    demo_rows = state["demo_rows"] if state else demonstrated_rows(demos, f)
-    ends = [0, *(1 + torch.nonzero(demo_rows[:, -2]).flatten()).tolist()]  # of demonstration n: rows ends[n] ...
-    B_o = TrajectoryBuffer(OBS_DIM[f.task], f.steps_per_epoch + len(demo_rows), f.symmetry)
-    B_d = TrajectoryBuffer(OBS_DIM[f.task], 0, f.symmetry)
-    B_d.rows = demo_rows  # all of them; filled counts those that were shown so far
+    B_d = demonstration_buffer(demos, f)
+    if state:
+        B_d.rows = state["demo_rows"]
+    ends = [0, *(1 + torch.nonzero(B_d.rows[:, -2]).flatten()).tolist()]  # demonstration n: rows ends[n] to ends[n + 1]
+    B_o = TrajectoryBuffer(OBS_DIM[f.task], f.steps_per_epoch + len(B_d.rows), f.symmetry)
 
-    def open_epoch(shown):
-        """Demonstrations, until B_d is full (Alg. 2); shown: how many it held. Returns how many it holds."""
-        first, shown = B_d.filled, min(shown + f.demos_per_epoch, len(ends) - 1)
-        B_d.filled = ends[shown]
+    def open_epoch():
+        """The next demonstrations, until B_d is full (Alg. 2)."""
+        first = B_d.filled
+        B_d.filled = ends[min(ends.index(first) + f.demos_per_epoch, len(ends) - 1)]
         if f.demos_in_B_o:
-            B_o.extend(demo_rows[first : B_d.filled])
-        return shown
+            B_o.extend(B_d.rows[first : B_d.filled])
 
     if state:
-        t, s, shown = state["t"], env.load(state["env"]), state["shown"]
+        t, s = state["t"], env.load(state["env"])
         learner.load(state["learner"])
         B_o.extend(state["B_o"])
-        B_d.filled = ends[shown]
+        B_d.filled = state["shown"]
         rng.bit_generator.state = state["rng"]
         torch.set_rng_state(state["torch_rng"])
     else:
-        t, (s, _), shown = 0, env.reset(), open_epoch(0)
+        t, (s, _) = 0, env.reset()
+        open_epoch()
     run.begin(demo_env_steps)
-    if demos:
+    if demos and f.clone_iters:
         learner.clone(B_d)
 
     while t < run.total_steps:
@@ -410,10 +417,11 @@ def loop(f, run):
         a = (mu + sigma * rng.standard_normal(4)).astype(np.float32)
 
         # step, store
-        s, _, terminated, truncated, info = env.step(a)
+        s2, r, terminated, truncated, info = env.step(a)
         t += 1
         cut = t % f.steps_per_epoch == 0  # of the trajectory, for the update; the episode goes on
-        B_o.store(*env.episode[-1][:4], terminated, terminated or truncated or cut, own=True)
+        B_o.store(s, a, r, s2, terminated, terminated or truncated or cut, own=True)
+        s = s2
 
         # reset
         if terminated or truncated:
@@ -425,11 +433,11 @@ def loop(f, run):
             if measured := learner.updates(B_o, B_d):
                 run.log_updates(measured, learner.net)
             B_o.filled = 0
-            shown = open_epoch(shown)
+            open_epoch()
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
         if run.must_save(t):
-            parts = {"learner": learner.state(), "B_o": B_o.rows[: B_o.filled].clone(), "demo_rows": demo_rows,
-                     "shown": shown, "env": env.state()}  # fmt: skip
+            parts = {"learner": learner.state(), "B_o": B_o.rows[: B_o.filled].clone(), "demo_rows": B_d.rows,
+                     "shown": B_d.filled, "env": env.state()}  # fmt: skip
             parts |= {"t": t, "rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
             run.save(parts, learner.policy())
             run.stop_if_asked(t)

@@ -496,7 +496,7 @@ def test_cloning_comes_before_the_first_step_from_the_first_B_d(world, epochs, m
     monkeypatch.setattr(ppo.Learner, "clone", lambda self, B_d: seen.append(B_d.filled) or clone(self, B_d))
     plain = world("plain", epochs=1, demos_per_epoch=2, **DEMONSTRATED)
     run = world("a", epochs=1, demos_per_epoch=2, clone_iters=3, **DEMONSTRATED)
-    assert seen == [LENGTHS[1]] * 2 and not np.array_equal(run.steps[0].a, plain.steps[0].a)
+    assert seen == [LENGTHS[1]] and not np.array_equal(run.steps[0].a, plain.steps[0].a)
 
 
 # ---- defaults --------------------------------------------------------------------------------------------------------
