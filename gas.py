@@ -12,7 +12,7 @@
 
 The maps take numpy arrays or torch tensors of any leading shape and return the same type, dtype and device.
 Differs from the printed Eq. 4: P_g (and P_o) rotate too, else R(s, a) = R(phi(s), psi(a)) does not hold; and
-q_1 goes down where the world turns up, because joint 1 points down.
+q_1 falls where the world turns counter-clockwise, because joint 1 points down.
 """
 
 import math
@@ -21,7 +21,8 @@ import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-# By observation width, 22 or 25: {how it rotates: [first index, ...]} and a task of it; their sectors are alike.
+# By observation width, 22 or 25: where the entries begin that rotate in each way; and one of its tasks (P2P-O and P&P
+# have the same sectors).
 _ROTATES, _TASK = {}, {}
 for _task, _layout in OBSERVATION.items():
     _ROTATES[OBS_DIM[_task]], _TASK[OBS_DIM[_task]] = {}, _task
@@ -45,7 +46,7 @@ def rotate(obs, angle):
     """The state with the world turned by `angle` rad about the base axis (Eq. 4 at any angle).
 
     obs: (..., 22 or 25) as KinovaEnv returns; angle: a number, or an array that broadcasts to obs.shape[:-1].
-    Returns the same type, shape and dtype. Exact but for the rounding of the dtype (float32: 4e-7).
+    Returns the same type, shape and dtype. Exact but for the rounding of the dtype (float32: 1e-6).
     """
     xp, out, index = _library(obs)
     c, s = (math.cos(angle), math.sin(angle)) if isinstance(angle, (int, float)) else (xp.cos(angle), xp.sin(angle))
@@ -94,8 +95,8 @@ def cylinder(obs):
 
     obs: (..., 22 or 25). P_g and P_o become (rho, theta, z), theta in rad from the arm's plane, and e becomes
     (rho_g - rho_e, theta_g - theta_e, z_g - z_e), the angle in [-pi, pi). The same for every turned world, like
-    `canonical`; unlike there, how far the arm has to turn stands in one entry and changes no other, so that a network
-    which has seen a few of these angles can act well at all of them.
+    `canonical`; unlike there, how far the arm has to turn changes theta_g and e's angle alone, so that a network which
+    has seen a few of these angles can act well at all of them.
     """
     xp, out, index = _library(obs)
     i_g, i_e, *i_o = index["vector"]
@@ -116,7 +117,7 @@ def mirror(obs, action):
     the state is of the world.
 
     obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Exact
-    to 1 mm: the TCP lies 1.35 mm beside the arm's plane (kinova_env.SIDE).
+    but for the 1.35 mm by which the TCP lies beside the arm's plane (kinova_env.SIDE).
     """
     _, out, index = _library(obs)
     first = [index[name][0] for name in ("angle", "sine", "")]  # q_1, sin q_1, dq_1/dt
@@ -153,8 +154,8 @@ def partition_of(obs, K=4):
 def aggregate(demos, K=4, num_demos=None):
     """Demonstrations of partition 0, mapped to all K (Sec. 3.2): each episode, then its K - 1 images.
 
-    demos: the arrays of `pid_demo.record` (rows: obs, act, rew, obs2, terminated, truncated, episode; one entry an
-    episode: partition, success, length, return); other partitions' episodes are left out. Returns the same arrays
+    demos: the arrays of `pid_demo.record` (rows: obs, act, rew, obs2, terminated, truncated, episode, perhaps
+    executed; one entry an episode: the others); other partitions' episodes are left out. Returns the same arrays
     with K times the episodes, of which the first `num_demos` are kept. Rewards and ends do not change under phi.
     """
     rows = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode", "executed")

@@ -9,8 +9,8 @@
 
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's
-normalised units. Gains: `authors` is the slow controller as seen of the authors
-(about 280 steps a demonstration of P2P), `fast` takes some half of them.
+normalised units. Gains: `authors` is about as slow as the authors' controller
+(280 steps a demonstration of P2P), `fast` takes some half of these.
 """
 
 import dataclasses
@@ -71,8 +71,8 @@ class PID:
         self._episode = None
 
     def _clearest(self, found, beside):
-        """Of postures (M, 4) the one nearest to the present of those that keep `clearance` from the cube, which lies
-        `beside` rad from the arm's plane; where none does, the one that comes least too near."""
+        """Of postures (M, 4) the one with the least way from the present, plus PENALTY times the `clearance` it lacks
+        from the cube, which lies `beside` rad from the arm's plane."""
         q, (x, y, z_o), (r, z) = np.array(self.env.q), self.env.cube, arm(found[:, 1:])
         rho = math.hypot(x, y)
         dr, dz = np.diff(r), np.diff(z)
@@ -86,8 +86,8 @@ class PID:
     def _over(self):
         """A posture on the way over P2P-O's cube, by midway points (Sec. 3.2): rise above it, cross, descend.
 
-        Beside the cube the arm first turns away from it. A function of the state, not of what was reached before, which
-        changes gradually: a clone of the demonstrations can follow it.
+        Beside the cube the arm first turns away from it. A function of the state, not of what was reached before: a
+        clone of the demonstrations can follow it, but where the cube lies dead ahead and the side to turn to flips.
         """
         places = (self.env.tcp, self.env.goal, self.env.cube)
         (x, y, z), (x_g, y_g, z_g), (x_o, y_o, z_o) = places
