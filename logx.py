@@ -114,6 +114,7 @@ class RunFlags:
     quiet: bool = flag(False, "no progress bar and table")
     tensorboard: bool = flag(False, "write TensorBoard's files too")
     variant: str = ""  # what differs from the recipe; set by fill_in
+    own_length: bool = True  # whether `epochs` is the recipe's; set by fill_in
 
 
 class _Parser(argparse.ArgumentParser):
@@ -216,6 +217,7 @@ def fill_in(flags, defaults, algo):
             raise BadInput(f"--{key} {getattr(flags, key)}: is of own recordings, and does not go with --demos")
     recipe = dataclasses.replace(type(flags)(task=flags.task, recipe=flags.recipe), **defaults)
     flags = dataclasses.replace(flags, **{key: v for key, v in defaults.items() if getattr(flags, key) is None})
+    flags.own_length = flags.epochs == recipe.epochs
     for each in (flags, recipe) if flags.demos is not None else ():  # the file says what they were recorded with
         each.gains = each.demo_noise = None
     changed = {key: value for key, value in dataclasses.asdict(flags).items()
@@ -225,7 +227,7 @@ def fill_in(flags, defaults, algo):
     variant = "-".join(f"{k}={v}" for k, v in texts.items()).replace(" ", "").replace("/", "_")
     flags.variant = variant if len(variant) <= 80 else f"{len(changed)}-changes-{zlib.crc32(variant.encode()):08x}"
     if flags.name is None:
-        length = f"epochs={flags.epochs}" if flags.epochs != recipe.epochs else ""
+        length = "" if flags.own_length else f"epochs={flags.epochs}"
         words = [flags.task, algo, flags.recipe, f"N{flags.num_demos}", f"lambda{flags.lambda_bc:g}", flags.symmetry]
         flags.name = "-".join([*words, *filter(None, (flags.variant, length)), f"seed{flags.seed}"])
     if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
@@ -461,6 +463,9 @@ class RunFolder:
                 else:
                     path.write_text(",".join(columns) + "\n")
                 self._files[table] = open(path, "a", newline="", buffering=1)  # noqa: SIM115
+            for path in [*self.folder.glob("evaluation*.csv"), *self.folder.glob("trajectories.npz")]:
+                if "-steps_" not in path.name:  # a test study of the policy so far, which now learns on
+                    path.rename(path.with_stem(f"{path.stem}-steps_{start}"))
             self._write_config()
         self._seconds = self.checkpoint["seconds"] if self.checkpoint else 0.0
         self._since = time.monotonic()

@@ -47,8 +47,9 @@ GREEN, GREY, BORDER = COLOURS[2], "#555555", (0, (4, 2))  # the tube of reachabl
 LOOK = {"font.family": "STIXGeneral", "mathtext.fontset": "stix", "font.size": 8, "legend.fontsize": 7,
         "legend.title_fontsize": 7, "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
         "axes.titlesize": 8.5, "pdf.fonttype": 42}  # fmt: skip
-DRAWINGS = ("learning", "success", "symmetry", "error", "demos", "trajectories", "partitions", "workspace")
-OF_NO_TASK = DRAWINGS[-2:]
+OF_TASK = ("learning", "success", "symmetry", "error", "demos", "trajectories")
+OF_NO_TASK = ("partitions", "workspace")
+DRAWINGS = OF_TASK + OF_NO_TASK
 
 
 @dataclass
@@ -145,15 +146,16 @@ def learning_figure(task, runs, flags):
     """Return over training episodes, a panel for each sweep of the paper (Fig. 6, 7, 8)."""
     if lines := named(runs, flags):
         return named_learning_figure(task, lines)
-    group, panels, empty = main_group(task, runs, flags.recipe), {"lambda": [], "demos": []}, []
+    group, panels = main_group(task, runs, flags.recipe), {"lambda": [], "demos": []}
     if not len(group):
         return None
-    for column in tables.columns(task, group).itertuples():
-        if len(of_column(group, column)):
-            for sweep in panels if column.sweep in ("baseline", "other") else [column.sweep]:
-                panels[sweep].append(column)
-        elif column.sweep != "pid":
-            empty.append(column_label(column))
+    found = [column for column in tables.columns(task, group).itertuples() if column.sweep != "pid"]
+    empty = [column_label(column) for column in found if not len(of_column(group, column))]
+    drawn = [column for column in found if len(of_column(group, column))]
+    printed = [column for column in drawn if column.sweep != "other"]
+    for column in printed or drawn:
+        for sweep in panels if column.sweep in ("baseline", "other") else [column.sweep]:
+            panels[sweep].append(column)
     swept = {sweep: drawn for sweep, drawn in panels.items() if sweep in [column.sweep for column in drawn]}
     panels = swept or {"lambda": panels["lambda"]}  # a panel without a run of its sweep would say nothing new
     figure = Figure(figsize=(3.2 * len(panels) + 0.8 * (len(panels) == 1), 3.4), layout="constrained")
@@ -215,8 +217,8 @@ def success_figure(task, runs, flags):
 
 
 def symmetry_figure(task, runs, flags):
-    """Test success over the number of real demonstrations, a line a symmetry; and of `gas` over the number of
-    partitions K, at as many real demonstrations and at as many after mapping. Robust runs of the commonest length."""
+    """Test success over the number of recorded demonstrations, a line a symmetry; and of `gas` over the number of
+    partitions K, at as many recorded and at as many after mapping. Robust runs of the commonest length."""
     best = tables.best_column(task, runs)
     runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
     runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
@@ -227,7 +229,7 @@ def symmetry_figure(task, runs, flags):
     if over_n.real.nunique() < 2:
         return None
     lines = {"real": dict(list(over_n.groupby("symmetry"))), "K": {}}
-    for fixed, text in (("real", "real demonstrations"), ("num_demos", r"$N_{demos}$")):
+    for fixed, text in (("real", "recorded demonstrations"), ("num_demos", r"$N_{demos}$")):
         counts = over_K.groupby(fixed).K.nunique()
         if counts.max() > 1:  # where most K are
             n = counts[counts == counts.max()].index[0]
@@ -237,11 +239,17 @@ def symmetry_figure(task, runs, flags):
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for ax, x in zip(axes, panels, strict=True):
         for i, (label, part) in enumerate(lines[x].items()):
-            values = part.pivot(index="seed", columns=x, values="success")
-            n = sorted(set(values.count()))
+            part = part.sort_values("num_demos").drop_duplicates(["seed", x], keep="last")
+            values = part.groupby(x).success.agg(list)
+            n = sorted(set(map(len, values)))
             label += f" ({' to '.join(map(str, dict.fromkeys((n[0], n[-1]))))} seed{'s' * (n[-1] > 1)})"
-            draw_band(ax, values.columns, values.to_numpy(), label, "P_scs_percent", marker=".", **style(i))
-        texts = {"real": "real demonstrations", "K": "number of partitions $K$"}
+            mean, low, high = np.transpose([tables.over_seeds("P_scs_percent", seeds) for seeds in values])
+            at = values.index * 1.03 ** (i - (len(lines[x]) - 1) / 2)  # side by side
+            ax.plot(at, mean, label=label, linewidth=1.1, marker=".", **style(i))
+            ax.errorbar(at, mean, (mean - low, high - mean), fmt="none", ecolor=style(i)["color"], elinewidth=0.7)
+            single = values.map(len) == 1
+            ax.scatter(at[single], mean[single], 4, color="w", zorder=3)
+        texts = {"real": "recorded demonstrations", "K": "number of partitions $K$"}
         ax.set(xscale="log", xlabel=texts[x], ylim=(-2, 102))
         ticks = sorted({value for part in lines[x].values() for value in part[x]})
         ax.set_xticks(ticks, [f"{tick}" for tick in ticks])
@@ -250,7 +258,7 @@ def symmetry_figure(task, runs, flags):
     axes[0].set_ylabel("success in test trials (%)")
     steps = int(over_n.total_env_steps.iloc[0])
     figure.suptitle(f"{TITLES[task]}: {best.algo.upper()} robust, {steps:,} environment steps", fontsize=9)
-    caption(figure, "Mean over seeds and its 95 % band (Student).")
+    caption(figure, "Mean over seeds and its 95 % interval (Student); hollow: a single seed.")
     return figure
 
 
@@ -265,7 +273,9 @@ def error_figure(task, runs, flags):
         paths = [c.trajectories for c in part.curves if c.trajectories.exists()]
         if errors := [error for path in paths for error in tables.read_errors(path)]:
             seeds = f"{len(paths)} seed{'s' * (len(paths) > 1)}"
-            panels[f"{textwrap.fill(label, 34) if of_all else label}\n{len(errors):,} trials, {seeds}"] = errors
+            tried = sum(len(c.evaluations[""]) for c in part.curves if c.trajectories.exists() and "" in c.evaluations)
+            head = textwrap.fill(label, 34) if of_all else label
+            panels[f"{head}\n{len(errors):,} of {max(tried, len(errors)):,} trials, {seeds}"] = errors
     if not panels:
         return None
     rows, across = math.ceil(len(panels) / 3), min(3, len(panels))
@@ -360,10 +370,12 @@ def demos_figure(task, runs, flags):
 
 
 def trajectories_figure(task, runs, flags):
-    """The successful ones of the first 20 test trials of the run with the highest P_scs (Fig. 9)."""
+    """The successful ones of the first 20 test trials of the run with the highest P_scs, of the paper's algorithm where
+    there is one (Fig. 9)."""
     tested = [run for run in runs.itertuples()
               if not run.curves.pid and run.curves.trajectories.exists() and run.curves.success >= 0]  # fmt: skip
-    best = max(tested, key=lambda run: run.curves.success, default=None)
+    algo = tables.best_column(task, runs).algo if tested else ""
+    best = max(tested, key=lambda run: (run.algo == algo, run.curves.success), default=None)
     if best is None:
         return None
     paths = [path for path in tables.read_paths(best.curves.trajectories)[1] if path["success"]]
@@ -480,7 +492,7 @@ def save_figure(name, task, runs, flags, paths, dpi=200):
 def save_figures(folder, runs, flags, ends, dpi=200):
     """Every figure; learning and error of each recipe of the paper's algorithm. Returns their names, without ending."""
     names = []
-    for task, name in [*product(TASKS, DRAWINGS[:-2]), *product([None], OF_NO_TASK)]:
+    for task, name in [*product(TASKS, OF_TASK), *product([None], OF_NO_TASK)]:
         recipes = [None]
         if name in ("learning", "error") and len(shown := tables.of_task(runs, task, variants=bool(flags.runs))):
             of_paper = shown[shown.algo == tables.best_column(task, shown).algo].recipe
@@ -493,11 +505,6 @@ def save_figures(folder, runs, flags, ends, dpi=200):
 
 
 # ---- main ------------------------------------------------------------------------------------------------------------
-
-
-def published_figures():
-    """The figures in data/results, in the order of DRAWINGS."""
-    return sorted(tables.RESULTS.glob("fig-*.png"), key=lambda path: DRAWINGS.index(path.stem.split("-")[1]))
 
 
 def draw_all(flags):
@@ -519,7 +526,7 @@ def check(flags):
         raise BadInput("--table, --figure, --all, --publish, --report: one of them is expected")
     of_task = bool(flags.table or flags.figure) and flags.figure not in OF_NO_TASK
     if bool(flags.task) != of_task:
-        raise BadInput(f"--task: one of {', '.join(TASKS)}, with --table, and --figure {', '.join(DRAWINGS[:-2])}")
+        raise BadInput(f"--task: one of {', '.join(TASKS)}, with --table, and --figure {', '.join(OF_TASK)}")
     for name, allowed in (("runs", of_task or flags.all), ("recipe", flags.figure in ("learning", "error")),
                           ("demos", flags.figure == "demos"), ("csv", flags.table), ("out", flags.figure)):  # fmt: skip
         if getattr(flags, name) and not allowed:
@@ -537,15 +544,18 @@ def main(argv=None):
         return print("\n".join(draw_all(flags)))
     if flags.report:
         names = save_figures(tables.RESULTS, tables.find_runs([tables.RESULTS])[0], flags, (".png",), dpi=130)
-        for path in set(tables.RESULTS.glob("fig-*.png")) - {tables.RESULTS / f"{name}.png" for name in names}:
+        figures = [tables.RESULTS / f"{name}.png" for name in names]
+        for path in set(tables.RESULTS.glob("fig-*.png")) - set(figures):
             path.unlink()
-        for page, text in publish.report(published_figures()).items():
+        for page, text in publish.report(figures).items():
             publish.write(page, text)
             print(f"wrote {page}")
         return
     runs, remarks = tables.find_runs(flags.runs) if flags.task else (None, [])
     if flags.runs and not len(tables.of_task(runs, flags.task, variants=True)):
         raise BadInput(f"--runs: no run of task {flags.task} among the {len(runs)} found")
+    if flags.recipe and flags.recipe not in (recipes := sorted(set(runs[runs.task == flags.task].recipe))):
+        raise BadInput(f"--recipe {flags.recipe}: the runs of task {flags.task} are of {', '.join(recipes) or 'none'}")
     if flags.table:
         text, _, frame = tables.make_table(flags.table, flags.task, runs, bool(flags.runs))
         if flags.csv:

@@ -68,14 +68,15 @@ def packed(paths, **arrays):
 
 
 def files_of_run(folder):
-    """{file name: bytes} that --publish writes of a run. Raises BadInput where it is not whole, or of no commit."""
+    """{file name: bytes} that --publish writes of a run, which may lie in another clone's data/results. Raises BadInput
+    where its files do not fit together, and of a run without a clean commit."""
     run, flag = tables.Curves(folder), f"--publish {folder}"
     if folder.resolve().is_relative_to(tables.RESULTS.resolve()):
         raise BadInput(f"{flag}: is published already")
     if not re.fullmatch("[0-9a-f]{40}", run.row["commit"]):
         raise BadInput(f"{flag}: made with git commit {run.row['commit']}; a clean one is expected")
-    if len(run.evaluations.get("", range(TRIALS))) < TRIALS:
-        raise BadInput(f"{flag}: evaluation.csv has fewer than {TRIALS} trials; run evaluate.py {folder} again")
+    if "" in run.evaluations and run.evaluations[""].trial.to_list() != list(range(TRIALS)):
+        raise BadInput(f"{flag}: evaluation.csv is not of trials 0 to {TRIALS - 1}; run evaluate.py {folder} again")
     if run.pid and "" not in run.evaluations:
         raise BadInput(f"{flag}: no evaluation.csv; run evaluate.py --pid first")
     # no path of a machine is published: of each text with folders, or FLAG=FOLDER/NAME, the name stays
@@ -90,8 +91,9 @@ def files_of_run(folder):
     if (folder / "policy.pt").exists():
         logx.load_torch(folder / "policy.pt")
         files["policy.pt"] = (folder / "policy.pt").read_bytes()
-    for path in sorted(folder.glob("*.csv")):
-        files[f"{path.name}.gz"] = gzip.compress(path.read_bytes(), mtime=0)  # the same bytes each time
+    for path in sorted([*folder.glob("*.csv.gz"), *folder.glob("*.csv")]):  # mtime=0: the same bytes each time
+        data = path.read_bytes() if path.suffix == ".gz" else gzip.compress(path.read_bytes(), mtime=0)
+        files[f"{path.name.removesuffix('.gz')}.gz"] = data
     printed = tables.columns(run.row["task"])
     drawn = run.row["variant"] == "" and ((run.row["num_demos"], run.row["lambda_bc"])
                                           in set(zip(printed.num_demos, printed.lambda_bc, strict=True)))  # fmt: skip
@@ -107,8 +109,8 @@ def files_of_run(folder):
 
 
 def publish(sources):
-    """Copies run folders and demonstration files into data/results, keeps the weights of the best run of each task,
-    algorithm and recipe, and writes index.csv. Returns remarks."""
+    """Copies run folders and demonstration files into data/results, keeps the weights of one run of each task,
+    algorithm and recipe, of the best column the best in validation, and writes index.csv. Returns remarks."""
     results, found = tables.RESULTS, {}
     for path in sources:  # all of them are read before anything is written
         if path.suffix == ".npz":
@@ -134,7 +136,7 @@ def publish(sources):
             os.replace(part, target)
         except OSError as error:
             raise BadInput(f"{target}: {error.strerror}; a run's folder is expected there") from None
-    rows, best = [], {}
+    rows, trained = [], {}
     for path in sorted(results.glob("[!.]*/config.json")):
         for run in tables.find_runs([path.parent])[0].to_dict("records"):
             success, last = run["curves"].success, run["curves"].validation[-1:].max() / 100
@@ -142,9 +144,12 @@ def publish(sources):
                 "env_steps": run["steps"], "finished": int(run["finished"]), "eval_success": last,
                 "P_scs_percent": success, "git_commit": run["commit"]})  # fmt: skip
             if (path.parent / "policy.pt").exists():
-                rank = run["variant"] != "", -np.nan_to_num(success, nan=-1), -run["steps"], path.parent.name
-                best.setdefault((run["task"], run["algo"], run["recipe"]), []).append(rank)
-    for *_, name in (rank for ranks in best.values() for rank in sorted(ranks)[1:]):
+                late = tables.late(run["curves"].validation)  # the test trials choose nothing
+                best = best_column(run["task"], pd.DataFrame([run]))
+                other = (run["variant"], run["num_demos"], run["lambda_bc"]) != ("", best.num_demos, best.lambda_bc)
+                rank = other, -np.nan_to_num(late, nan=-1), -run["steps"], path.parent.name
+                trained.setdefault((run["task"], run["algo"], run["recipe"]), []).append(rank)
+    for *_, name in (rank for ranks in trained.values() for rank in sorted(ranks)[1:]):
         (results / name / "policy.pt").unlink()
     write(results / "index.csv", pd.DataFrame(rows, columns=INDEX_COLUMNS).to_csv(index=False, float_format="%g"))
     return [*(f"published {target}" for target in found), f"wrote {results / 'index.csv'}, {len(rows)} runs"]
@@ -157,16 +162,19 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "demos": "More demonstrations are better",
     "plain": "Demo-EASE beats the plain algorithm",
     "mask": "The mask matters",
+    "mapping": "Demonstrations of one partition, mapped to all, are better than as they are",
     "symmetry": "Symmetric demonstrations cost less",
     "PID": "The agent beats its demonstrator",
     "quick": "The agent is quicker than its demonstrator (ours)",
 }
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
+CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
+UNSEEN = "first trial 50000"  # the test study of 500 trials that were never looked at while the recipes were made
 
 
 def comparisons(task, runs):
     """(claim, what is compared, one side, the other, margin) that a task's finished runs allow; a side is a list of
-    Curves, or None. The claim is that one side is better, or with a margin that it is not worse by more."""
+    Curves, or None. The claim is that the first is better, or with a margin that it is not worse by more."""
     best, printed = best_column(task), columns(task)
     key, ends = (best.num_demos, best.lambda_bc), {}
     for sweep, value in (("lambda", "lambda_bc"), ("demos", "num_demos")):
@@ -178,61 +186,75 @@ def comparisons(task, runs):
     for group, found in at.items():
         (algo, recipe, symmetry, variant, total), label = group, group_label(group)
         if variant == "mask=none":
-            masked = at.get((algo, recipe, symmetry, "", total), {})
-            yield "mask", f"{label}, and with the mask", masked.get(key), found.get(key), 0
+            with_mask = (algo, recipe, symmetry, "", total)
+            masked = at.get(with_mask, {}).get(key)
+            yield "mask", f"{group_label(with_mask)}, and with mask=none", masked, found.get(key), 0
         own_length = all(curves.own_length for side in found.values() for curves in side)
         if variant not in ("", *(f"gains={name}" for name in pid_demo.GAINS)) or not (variant or own_length):
             continue  # a recipe of another length is there for the ablations
-        gains = found[key][0].config["gains"] if key in found else None
-        theirs = pid.get(gains)
-        compared = f"{label}, and the PID with {gains} gains in the same trials"
-        compared += f" ({theirs[0].success:.1f} %)" if theirs else ""
-        yield "PID", compared, found.get(key), theirs, 0
-        yield "quick", compared, found.get(key), theirs, 0
-        if variant:
+        if symmetry == tables.OWN_SYMMETRY.get(recipe):
+            gains = found[key][0].config["gains"] if key in found else None
+            theirs, compared = pid.get(gains), f"{label}, and the PID with {gains} gains in the same trials"
+            others = theirs[0].evaluations.items() if theirs else ()
+            at_length = [f"{what} {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in others
+                         if what.startswith("horizon")]  # fmt: skip
+            yield "PID", compared + f" (at the {', '.join(at_length)})" * bool(at_length), found.get(key), theirs, 0
+            yield "quick", compared, found.get(key), theirs, 0
+        if variant or recipe not in tables.OWN_SYMMETRY:
             continue
         for sweep, (high, low) in ends.items():
             names = [f"{N} demonstrations, λ_BC = {lam:g}" for N, lam in (high, low)]
             yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low), 0
-        yield "plain", f"{label}: with demonstrations, and without", found.get(key), found.get((0, 0.0)), 0
+        plain = [curves for (N, _), part in found.items() if not N for curves in part]
+        yield "plain", f"{label}: with demonstrations, and without", found.get(key), plain, 0
         for (N, lam), curves in found.items() if symmetry == "gas" else ():
             recorded, none = curves[0].row["recorded"], at.get((algo, recipe, "none", "", total), {})
-            yield ("symmetry", f"{label}: {recorded} recorded and mapped to {N}, and {recorded} as they are", curves,
+            yield ("mapping", f"{label}: {recorded} recorded and mapped to {N}, and {recorded} as they are", curves,
                    none.get((recorded, lam)), 0)  # fmt: skip
             yield ("symmetry", f"{label}: {recorded} recorded and mapped to {N}, and {N} recorded: at most {MARGIN} "
                    "points worse", curves, none.get((N, lam)), MARGIN)  # fmt: skip
 
 
 def findings_lines(runs):
-    """Each claim of the paper, the difference in our test success, and what it says: Welch's interval over seeds; with
-    the PID, which is one controller, Student's of the differences from it in the same trials."""
-    lines, said = [["claim", "task", "compared", "difference", "seeds", ""]], {}
+    """Each claim of the paper, the difference in our test success, first side minus second, and what it says: Welch's
+    interval over seeds; with the PID, which is one controller, Student's of the differences from it in the same trials.
+    Comparisons with a single seed on a side have no interval and say nothing."""
+    lines, said = [["claim", "task", "compared", "success (%)", "difference", "seeds", ""]], {}
     found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
         least = 5 if claim == "quick" else 0  # percent: with less, next to no trial is one that both succeed in
         ours, theirs = ([curves for curves in side or () if curves.success >= least] for side in (one, other))
         if not (ours and theirs):
             continue
-        gap, *ends = evaluate.difference([c.success for c in ours], [c.success for c in theirs])
+        ours_mean, theirs_mean = (np.mean([curves.success for curves in side]) for side in (ours, theirs))
+        gap, low, high = tables.difference("P_scs_percent", *([c.success for c in side] for side in (ours, theirs)))
         if claim in ("PID", "quick"):
             metric, sign = ("P_scs_percent", 1) if claim == "PID" else ("steps", -1)
             pairs = [evaluate.paired(curves.evaluations[""], theirs[0].evaluations[""]) for curves in ours]
             gap, *ends = evaluate.over_seeds([sign * pair[metric][0] for pair in pairs])
-        low, high = ends if claim == "quick" else np.clip(ends, -100, 100)
+            low, high = ends if claim == "quick" else np.clip(ends, -100, 100)
+        if low != low:
+            continue
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
+        if claim == "PID" and theirs_mean >= CEILING and low > -MARGIN:
+            verdict = "no room above it"
+        if claim == "quick":
+            both = np.mean([sum(c.evaluations[""].success * theirs[0].evaluations[""].success) for c in ours])
+            compared += f", {both:.0f} that both succeed in"
+        unit = "steps fewer" if claim == "quick" else "points"
         seeds = f"{len(ours)}" if claim in ("PID", "quick") else f"{len(ours)} and {len(theirs)}"
-        text = between(gap, low, high, 1) + (" steps" if claim == "quick" else " points") if low == low else "-"
-        said.setdefault(claim, []).append(
-            [TITLES[task], compared, text, seeds, f"*{verdict if low == low else 'too few seeds'}*"])  # fmt: skip
+        said.setdefault(claim, []).append([
+            TITLES[task], compared, f"{ours_mean:.1f} and {theirs_mean:.1f}",
+            f"{between(gap, low, high, 1)} {unit}", seeds, f"*{verdict}*"])  # fmt: skip
     for claim, sentence in CLAIMS.items():
-        lines += [[sentence, *line] for line in said.get(claim, [["", "no runs", "", "", ""]])]
+        lines += [[sentence, *line] for line in said.get(claim, [["", "not yet run with two seeds a side", *[""] * 4]])]
     return lines
 
 
 def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
-    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "seeds", "steps: demonstrated + own",
-              "command", "minutes"]]  # fmt: skip
+    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "in unseen ones (%)", "seeds",
+              "steps: demonstrated + own", "command", "minutes"]]  # fmt: skip
     for task in PRINTED:
         printed, best = columns(task), best_column(task)
         (plain,), (pid,) = (printed[printed.sweep == sweep].itertuples() for sweep in ("baseline", "pid"))
@@ -240,26 +262,43 @@ def results_lines(runs):
         for (recipe, name), algo in product((("robust", "robust"), ("paper", "as published")), ("ddpg", "ppo")):
             group = main_group(task, of_task[of_task.algo == algo], recipe)
             command = f"{algo}_demoease.py --task {task} --recipe {recipe}"
-            agents += [(f"Demo-EASE {algo.upper()}, {name}", best._replace(algo=algo), group, command),
-                       (f"{algo.upper()}, {name}", plain._replace(algo=algo), group,
-                        f"{command} --num_demos 0 --lambda_bc 0")]  # fmt: skip
-        agents += [(f"PID, {gains} gains", pid, of_task[of_task.recipe == gains],
-                    f"evaluate.py --pid --task {task} --gains {gains}") for gains in pid_demo.GAINS]  # fmt: skip
-        for name, column, group, command in agents:
-            part = of_column(group, column)
-            rows = tables.table("test", task, part)
-            found = rows[(rows.metric == "P_scs_percent") & (rows.evaluation == "") & (rows.seeds > 0)]
+            agents += [(f"Demo-EASE {algo.upper()}, {name}", best._replace(algo=algo), command,
+                        of_column(group, best._replace(algo=algo))),
+                       (f"{algo.upper()}, {name}", plain._replace(algo=algo),
+                        f"{command} --num_demos 0 --lambda_bc 0", group[group.num_demos == 0])]  # fmt: skip
+        agents += [(f"PID, {gains} gains", pid, f"evaluate.py --pid --task {task} --gains {gains}",
+                    of_task[of_task.recipe == gains]) for gains in pid_demo.GAINS]  # fmt: skip
+        for name, column, command, part in agents:
             trained = [run.progress for run in part.curves if not run.pid]
+            theirs = column.P_scs_percent if column.algo in (best.algo, "pid") and "fast" not in name else math.nan
+            about = [TITLES[task], name, "-" if theirs != theirs else f"{theirs:g}"]
+            if not len(part) and column == best:
+                lines.append([*about, "not run yet", "", "", "", f"`{command}`", ""])
             steps, demo_steps, seconds = ([table[name].max() for table in trained]
                                           for name in ("env_steps", "demo_env_steps", "seconds"))  # fmt: skip
-            for row in found.iloc[:1].to_dict("records"):
-                printed = row["paper"] if row["recipe"] != "fast" else math.nan  # the paper has one controller
-                lines.append([TITLES[task], name, "-" if printed != printed else f"{printed:g}",
-                              between(row["mean"], row["low"], row["high"], 1),
-                              f"{row['seeds']}" + " (unfinished)" * bool(row["unfinished"]) if trained else "-",
-                              f"{np.mean(demo_steps) / 1000:.0f}k + {np.mean(steps) / 1000:.0f}k" if trained else "-",
-                              f"`{command}`", f"{np.median(seconds) / 60:.0f}" if trained else "-"])  # fmt: skip
+            found = tables.measured("test", part)
+            if "" not in found:
+                continue
+            success = success_in(found, "")
+            if tables.LATE in found:
+                late = np.mean([metrics["P_scs_percent"] for _, metrics in found[tables.LATE]])
+                success += f"; {late:.1f} over the last fifth of training"
+            for what in found if column.algo == "pid" else ():
+                success += f"; {what}: {success_in(found, what)}" * what.startswith("horizon")
+            unfinished = f" ({sum(~part.finished)} unfinished)" * (not all(part.finished))
+            lines.append([*about, success, success_in(found, UNSEEN) if UNSEEN in found else "-",
+                          f"{len(found[''])}{unfinished}" if trained else "-",
+                          f"{np.mean(demo_steps) / 1000:.0f}k + {np.mean(steps) / 1000:.0f}k" if trained else "-",
+                          f"`{command}`", f"{np.median(seconds) / 60:.0f}" if trained else "-"])  # fmt: skip
     return lines
+
+
+def success_in(found, what):
+    """Success in the study `what` of tables.measured, with its interval: over seeds, of a single one over trials."""
+    mean, *ends = tables.over_seeds("P_scs_percent", [metrics["P_scs_percent"] for _, metrics in found[what]])
+    if len(found[what]) == 1:
+        ends = evaluate.over_trials(found[what][0][0].curves.evaluations[what])["P_scs_percent"]
+    return between(mean, *ends, 1)
 
 
 WATCHED = {"pretanh_own (PPO: mean_action_own)": ("pretanh_own", "mean_action_own"),

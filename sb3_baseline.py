@@ -34,7 +34,7 @@ class Flags(logx.RunFlags):
     n_step: int | None = flag(None, "rewards in a target; 1, with demonstrations 10", low=1)
     seed: int = flag(0, "of all that is random", low=0, high=2**32 - 1)
     epochs: int = flag(100, "of 1000 steps", low=1)
-    act_noise: float = flag(0.1, "of td3 and ddpg, which have none of their own", low=0)
+    act_noise: float | None = flag(None, "of td3 and ddpg, which have none of their own; 0.1", low=0)
     resume: bool = flag(False, "begin an interrupted run anew")
     # of the other scripts, or what tables and the recording of demonstrations ask for
     quick: bool = False
@@ -53,8 +53,10 @@ class Flags(logx.RunFlags):
 def resolve(flags):
     """The flags, with a name. Raises logx.BadInput."""
     flags = logx.check_flags(flags)
-    T = TASKS[flags.task].horizon
-    defaults = {"algo": flags.algo, "max_ep_len": T, "n_step": 10 if flags.num_demos else 1}
+    if flags.algo == "sac" and flags.act_noise is not None:
+        raise logx.BadInput(f"--act_noise {flags.act_noise}: --algo sac has noise of its own; allowed with td3, ddpg")
+    defaults = {"algo": flags.algo, "max_ep_len": TASKS[flags.task].horizon, "n_step": 10 if flags.num_demos else 1,
+                "act_noise": None if flags.algo == "sac" else 0.1}  # fmt: skip
     return logx.fill_in(flags, defaults, flags.algo)
 
 

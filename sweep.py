@@ -170,7 +170,7 @@ def combinations(vary):
     values = {}
     for text in vary or ():
         name, equals, given = text.partition("=")
-        if not equals or name in (*NOT_VARIED, *values):
+        if not (name and equals) or name in ("help", *NOT_VARIED, *values):
             raise logx.BadInput(f"--vary {text}: must be FLAG=VALUE,... once, and not of {', '.join(NOT_VARIED)}")
         values[name] = given.split(",")
     return [dict(zip(values, combination, strict=True)) for combination in itertools.product(*values.values())]
@@ -343,20 +343,20 @@ def parse(argv=None):
 
 def print_status(jobs, data_dir):
     """How far each run in data_dir is, of the grid or not, and how many of the grid's are not begun."""
-    begun = {job.folder: job for job in jobs if job.folder.exists()}
-    for file in sorted(data_dir.glob("*/config.json")):
+    begun, count = {job.folder: job for job in jobs if job.folder.exists()}, Counter()
+    for folder in dict.fromkeys([*begun, *(file.parent for file in sorted(data_dir.glob("*/config.json")))]):
         try:
-            config = json.loads(file.read_text())
-            begun.setdefault(file.parent, Job(file.parent, config["epochs"] * config["steps_per_epoch"]))
-        except (OSError, ValueError, LookupError, TypeError) as error:
-            print(f"{file}: no run's settings ({logx.one_line(error)})", file=sys.stderr)
-    count = Counter()
-    for job in begun.values():
-        (state, error), rows, to_come = job.state(), job.rows(), ""
-        count[state] += 1
-        if rows and state in ("running", "stopped"):
-            to_come = hours((job.total - job.steps()) / job.steps() * float(rows[-1]["seconds"])) + " to come"
-        print(f"{state:8} {100 * job.steps() / job.total:5.1f} %  {to_come:15} {job.folder}  {error}".rstrip())
+            config = {} if folder in begun else json.loads((folder / "config.json").read_text())
+            if config.get("algo") == "pid":
+                continue  # an evaluation of the demonstrator, no run
+            job = begun.get(folder) or Job(folder, int(config["epochs"] * config["steps_per_epoch"]))
+            (state, error), rows, to_come = job.state(), job.rows(), ""
+            if rows and state in ("running", "stopped"):
+                to_come = hours((job.total - job.steps()) / job.steps() * float(rows[-1]["seconds"])) + " to come"
+            print(f"{state:8} {100 * job.steps() / job.total:5.1f} %  {to_come:15} {job.folder}  {error}".rstrip())
+            count[state] += 1
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ZeroDivisionError) as error:
+            print(f"{folder}: no run's config.json and progress.csv ({logx.one_line(error)})", file=sys.stderr)
     missing = sum(job.folder not in begun for job in jobs)
     print(", ".join(f"{n} {state}" for state, n in sorted(count.items())) or f"{data_dir}: no runs", end="")
     print(f"; of the {len(jobs)} runs asked for, {missing} are not begun")
@@ -378,6 +378,10 @@ def main(argv=None):
         return 0
     if flags.cluster:
         return submit(todo, flags)
+    try:
+        flags.data_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise logx.BadInput(f"--data_dir {flags.data_dir}: {error.strerror}; a folder is expected") from None
     os.nice(flags.nice)
     if run_here(todo, flags.jobs or 1):
         return STOPPED

@@ -73,15 +73,16 @@ def read_csv(path, numbers):
     """DataFrame of a CSV file, or of the one with .gz behind its name. `numbers`: columns that are never blank."""
     with reading(path, f"a table with numbers in {', '.join(numbers)}"):
         table = pd.read_csv(path if path.exists() else path.with_name(f"{path.name}.gz"))
-        known = np.isfinite(table[list(numbers)].astype(float)).all(axis=1)
+        values = table[list(numbers)].apply(pd.to_numeric, errors="coerce")
+        known = np.isfinite(values.astype(float)).all(axis=1)
         if not known[:-1].all():  # the last line may be cut short: its run is writing it
             raise ValueError(f"no number in line {known.argmin() + 2}")
-        return table[known]
+        return table.assign(**values)[known]
 
 
 def split(values, length):
     """values (sum(length + 1), ...), of t = 0 ... length of one episode after another, as a list of one each."""
-    if len(values) != np.sum(length + 1):
+    if np.min(length, initial=0) < 0 or len(values) != np.sum(length + 1):
         raise ValueError("its arrays do not fit together")
     return np.split(values, np.cumsum(length + 1)[:-1])[: len(length)]  # of no episode, np.split makes one
 
@@ -89,7 +90,7 @@ def split(values, length):
 def read_errors(path):
     """||e_t|| in m (length + 1,) of each successful trial in a trajectories.npz."""
     with reading(path, "a trajectories.npz of evaluate.py"), np.load(path, allow_pickle=False) as file:
-        errors = split(file["error"], file["length"])
+        errors = split(file["error"].astype(float), file["length"])
         return [error for error, success in zip(errors, file["success"], strict=True) if success]
 
 
@@ -108,7 +109,7 @@ def read_paths(path):
             cube = [s[0, at["P_o"]] if "P_o" in at else np.full(3, np.nan, np.float32) for s in states]
         else:
             goal, cube = file["goal"], file["object"]
-            tcp = split(file["tcp"], length[: len(goal)])
+            tcp = split(file["tcp"].reshape(-1, 3), length[: len(goal)])
         paths = zip(tcp, goal, cube, file["success"], strict=False)
         return task, [dict(zip(("tcp", "goal", "object", "success"), path, strict=True)) for path in paths]
 
@@ -120,10 +121,15 @@ class Curves:
         self.folder, self.trajectories = folder, folder / "trajectories.npz"
         with reading(folder / "config.json", "a run's flags as JSON"):
             self.config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-            c = {"variant": "", "versions": {}} | self.config
+            c = {"variant": "", "versions": {}, "partitions": 4} | self.config
             self.pid = c["algo"] == "pid"
             if self.pid:
                 c |= dict(recipe=c["gains"], symmetry="", num_demos=0, lambda_bc=0, seed=0, epochs=0, steps_per_epoch=0)
+            kinds = dict.fromkeys(("task", "algo", "recipe", "symmetry", "variant"), str)
+            kinds |= dict.fromkeys(("num_demos", "seed", "epochs", "steps_per_epoch", "partitions"), int)
+            for name, kind in kinds.items():
+                if type(c[name]) is not kind or (name, c[name]) == ("partitions", 0):
+                    raise ValueError(f"{name} {logx.one_line(c[name])}")
             if c["task"] not in TASKS:
                 raise ValueError(f"task {c['task']}")
             names = ("task", "algo", "recipe", "symmetry", "variant", "num_demos", "seed")
@@ -139,7 +145,7 @@ class Curves:
 
     @cached_property
     def progress(self):
-        return read_csv(self.folder / "progress.csv", ("epoch", "env_steps", "seconds"))
+        return read_csv(self.folder / "progress.csv", ("epoch", "env_steps", "demo_env_steps", "seconds"))
 
     @cached_property
     def evaluations(self):
@@ -170,8 +176,8 @@ class Curves:
 
     @property
     def own_length(self):
-        """Whether it was asked for as many epochs as its recipe has; else its folder names them (logx.fill_in)."""
-        return "-epochs=" not in self.folder.name
+        """Whether it was asked for as many epochs as its recipe has; of runs that do not say so, their folder does."""
+        return self.config.get("own_length", "-epochs=" not in self.folder.name)
 
     @property
     def own_success(self):
@@ -183,7 +189,8 @@ class Curves:
         """Success in percent on the trials while training, a Series by environment steps; empty where none."""
         if self.pid or "eval_success" not in self.progress:
             return pd.Series(dtype=float)
-        return 100 * self.progress.set_index("env_steps").eval_success.dropna()
+        with reading(self.folder / "progress.csv", "eval_success in numbers"):
+            return 100 * pd.to_numeric(self.progress.set_index("env_steps").eval_success).dropna()
 
 
 def find_runs(named=None):
@@ -209,8 +216,9 @@ def find_runs(named=None):
     for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
         kept, *others = twins.itertuples()
         copies = kept.commit, kept.steps, kept.curves.folder.name  # of a run and its published copy nothing is said
+        told = [x for x in others if x.own == kept.own or (x.commit, x.steps, x.curves.folder.name) != copies]
         remarks += [f"left out: {other.curves.folder}; {kept.curves.folder} is of the same configuration and seed"
-                    for other in others if (other.commit, other.steps, other.curves.folder.name) != copies]  # fmt: skip
+                    for other in told]  # fmt: skip
         runs = runs.drop([other.Index for other in others])
     remarks += [f"unfinished: {run.curves.folder}, {run.steps:,} of {run.total_env_steps:,} environment steps"
                 for run in runs[~runs.finished].itertuples()]  # fmt: skip
@@ -297,24 +305,30 @@ def separated(a, b):
     return math.comb(len(a) + len(b), len(a)) >= 40 and bool(np.min(a) > np.max(b) or np.max(a) < np.min(b))
 
 
+def late(validation):
+    """Mean success in percent of the last fifth of a run's evaluations while training; NaN where there are none."""
+    return validation.iloc[-math.ceil(len(validation) / 5) :].mean()
+
+
 def measured(kind, runs):
-    """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies, BEST and LATE."""
+    """{evaluation: [(run, its metrics)]} of a group: "" as in the paper, other studies; of runs as published, whose
+    success swings, BEST and LATE."""
     found = {}
     for run in runs.itertuples():
         if kind == "training" and not run.curves.pid:
             found.setdefault("", []).append((run, training_metrics(run.curves.episodes["return"].to_numpy())))
         for what, trials in run.curves.evaluations.items() if kind == "test" else ():
             found.setdefault(what, []).append((run, evaluate.metrics(trials)))
-        if kind == "test" and len(run.curves.validation):
+        if kind == "test" and run.recipe == "paper" and len(run.curves.validation):
             values = run.curves.validation
-            for what, value in ((BEST, values.max()), (LATE, values[-math.ceil(len(values) / 5) :].mean())):
+            for what, value in ((BEST, values.max()), (LATE, late(values))):
                 found.setdefault(what, []).append((run, {"P_scs_percent": value}))
     return dict(sorted(found.items(), key=lambda item: (item[0] in (BEST, LATE), item[0])))
 
 
 def table(kind, task, runs):
     """The table as DataFrame: a row for each column, group, evaluation and metric, in the paper's order; of a printed
-    column without runs, rows with 0 seeds."""
+    column without (tested) runs, rows with 0 seeds. Unfinished runs count, and are counted."""
     rows = []
     for column in columns(task, runs).itertuples():
         about, begun = {"task": task} | {name: getattr(column, name) for name in ("sweep", *COLUMN)}, len(rows)
@@ -337,7 +351,7 @@ def table(kind, task, runs):
                         "interval": method if low == low else "", "na_seeds": int(np.isnan(values).sum()),
                         # as printed, so that the mark agrees with what the reader sees
                         "paper_outside": int((paper < round(low, digits) or paper > round(high, digits)) and not what
-                                             and group[1] != "fast"),  # the paper has one controller
+                                             and group[1] in ("paper", "authors")),  # of the paper's method alone
                         "values": values})  # fmt: skip
         if len(rows) == begun and column.sweep != "other" and (column.sweep != "pid" or kind == "test"):
             none = dict.fromkeys(GROUP[1:], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
@@ -390,12 +404,13 @@ def table_lines(kind, rows):
 
 def table_notes(kind, rows):
     """What stands below the table, as lines."""
-    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t; * where the paper's lies outside it."]
+    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t; as published, * where the paper's lies "
+             "outside it."]  # fmt: skip
     if kind == "training":
-        notes += ["[-]: a single seed has none. T50 is by our rule (N/A where R90 <= 0); the paper's cannot be."]
+        notes += ["[-]: a single seed has none. Our T50 (N/A where R90 <= 0) is not the paper's: DIFFERENCES 56."]
     else:
         notes += ["A single seed: its interval over trials (P_scs: Wilson's), which knows nothing of other seeds.",
-                  "Evaluations in training: 50 validation trials each; the best is not the last policy's."]  # fmt: skip
+                  "Evaluations in training, of validation trials: the best one is not the last policy's."]  # fmt: skip
     ours = rows[(rows.seeds > 0) & (rows.algo != "pid")]
     for group, texts in ours.groupby(GROUP, sort=False).commits:
         notes.append(f"Commits of {group_label(group)}: {', '.join(sorted(set(' '.join(texts).split())))}")
@@ -411,7 +426,7 @@ def undecided(kind, rows):
             compared = one.sweep == other.sweep or "baseline" in (one.sweep, other.sweep)
             if not (compared and abs(one.paper - other.paper) > 0):  # not where either is NaN
                 continue
-            gap, low, high = evaluate.difference(one.values, other.values)
+            gap, low, high = difference(metric, one.values, other.values)
             verdict = ("too few" if low != low else "cannot tell apart" if low <= 0 <= high else
                        "agree on" if (gap > 0) == (one.paper > other.paper) else "rank the other way")  # fmt: skip
             pair = " and ".join(f"N_demos={row.num_demos} lambda_BC={row.lambda_bc:g}" for row in (one, other))
@@ -427,15 +442,15 @@ def undecided(kind, rows):
 
 def compared_lines(kind, runs):
     """The table `kind` of COMPARED as lines of cells: success in the test study, the steps that its successful trials
-    take, success of all own episodes while training, each with Welch's difference. Where what a variant is compared
-    with has no runs of its length, the test study of its longest is the reference."""
+    take, success of all own episodes while training, each with Welch's difference; of finished runs. Where the recipe
+    has no runs of a variant's length, the test study of its longest is the reference."""
     by, base, held = COMPARED[kind]
     wanted = {"variant": own_symmetry(runs), "symmetry": runs.variant == "",
               "K": (runs.symmetry == "gas") & runs.variant.str.fullmatch(r"(partitions=\d+)?")}[by]  # fmt: skip
     runs = runs[runs.finished & (runs.algo != "pid") & wanted]
     alike = [name for name in GROUP[:-1] if name != by and (by, name) != ("K", "variant")]
     lines = [["group", "lambda_BC", by, "recorded", "N_demos", "success in the test study, by seed (%)", "mean",
-              "difference", "steps", "difference", "success while training (%)", "difference"]]  # fmt: skip
+              "difference", "steps", "difference", "own episodes (%)", "difference"]]  # fmt: skip
     groups = [members for same in held for _, members in runs.groupby([*alike, "lambda_bc", same])]
     for members in groups:
         if members[by].nunique() == 1 and (by != "variant" or "" in members.variant.values):
@@ -445,7 +460,9 @@ def compared_lines(kind, runs):
         for key in sorted(found, key=lambda key: (key[0] != base and by != "K", key)):
             (value, steps, recorded, N), part = key, found[key]
             same = bases.get(steps, ()) if value != base else ()
-            longest = bases.get(max(bases, default=0), ()) if value != base else ()
+            if by != "variant" and bases and not same and value != base:
+                continue  # of another length than what it is compared with
+            longest = bases.get(max(bases, default=0), ()) if (by, value != base) == ("variant", True) else ()
             cells = []
             for name, digits, reference in (
                 ("success", 1, same or longest),
@@ -475,7 +492,8 @@ def make_table(kind, task, runs, variants=False):
         base = {"ablations": "the recipe", "symmetries": "no symmetry", "partitions": "K = 4"}[kind]
         notes = [
             f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch; [-]: no spread to see.",
-            "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (permutation test).",
+            "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (permutation test; 3 "
+            "against 3 are too few for one). Own episodes: all of the training's, exploration included.",
         ]
         if kind == "ablations":
             notes += [
@@ -517,12 +535,12 @@ def main_group(task, runs, recipe=None):
 def gaps(task, runs):
     """The commands that fill the gaps in a task's tables and figures, as lines to print."""
     main, lines, names = main_group(task, runs), [], []
-    for column in columns(task).itertuples():
+    for column in columns(task).drop_duplicates(COLUMN).itertuples():  # P&P's (400, 15) stands in both of its sweeps
         value = {"lambda": f"={column.lambda_bc:g}", "demos": f"={column.num_demos}"}.get(column.sweep, "")
         if column.sweep != "pid" and not len(of_column(main, column)):
             names.append(column.sweep + value)
     if names:
-        recipe = main.recipe.iloc[0] if len(main) else "robust"
+        recipe = next(iter(set(main.recipe) & set(OWN_SYMMETRY)), "robust")
         lines.append(f"python sweep.py --task {task} --recipe {recipe} --columns {' '.join(names)} --seeds 5 --jobs 2")
     untested = [run.curves.folder for run in runs[runs.finished].itertuples() if "" not in run.curves.evaluations]
     lines += [f"python evaluate.py {os.path.relpath(folder)} --trials 500 --jobs 2" for folder in untested]

@@ -409,6 +409,18 @@ def test_a_resume_cuts_the_curves_back_to_the_checkpoint_and_goes_on_from_there(
     assert (stopped / "progress.csv").read_text().splitlines()[-1].startswith("2,100,7,")  # its demonstrations too
 
 
+def test_a_test_study_of_a_policy_that_learns_on_is_set_aside_and_says_of_which_steps_it_is(stopped):
+    for name in ("evaluation.csv", "evaluation-horizon_600.csv", "trajectories.npz"):
+        (stopped / name).write_text(name)
+    for _ in range(2):
+        with folder_of(stopped, resume=True) as run:
+            run.begin()
+    found = {path.name: path.read_text() for path in stopped.glob("*-steps_*")}
+    assert found == {"evaluation-steps_50.csv": "evaluation.csv", "trajectories-steps_50.npz": "trajectories.npz",
+                     "evaluation-horizon_600-steps_50.csv": "evaluation-horizon_600.csv"}  # fmt: skip
+    assert not (stopped / "evaluation.csv").exists()
+
+
 def test_a_resume_without_a_checkpoint_begins_a_new_run_and_says_so(tmp_path, capsys):
     with folder_of(tmp_path / "a") as run:
         run.begin()

@@ -152,6 +152,8 @@ def test_varied_values_are_written_as_in_the_names_of_folders():
     (["--data_dir", __file__], f"--data_dir {__file__}: is a file"),
     (["--vary", "gamma"], "--vary gamma: must be FLAG=VALUE"),
     (["--vary", "seed=1,2"], "--vary seed=1,2: must be FLAG=VALUE,... once, and not of task, seed"),
+    (["--vary", "help=True"], "--vary help=True: must be FLAG=VALUE"),
+    (["--vary", "=1"], "--vary =1: must be FLAG=VALUE"),
     (["--vary", "gamma=0.9", "gamma=1"], "--vary gamma=1: must be FLAG=VALUE,... once"),
     (["--vary", "gamma=0.9,2"], "ddpg_demoease.py: --gamma 2.0: must be at least 0 and at most 1"),
     (["--vary", "clip_ratio=0.1"], "ddpg_demoease.py: --clip_ratio: no such flag"),
@@ -238,12 +240,14 @@ def test_status_lists_whatever_lies_in_the_folder(swept, tmp_path, capsys):
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "config.json").write_text("{")
     (tmp_path / "slurm").mkdir()
+    (tmp_path / "pid").mkdir()
+    (tmp_path / "pid" / "config.json").write_text('{"algo": "pid"}')  # of evaluate.py --pid: no run
     sweep.main(["--status", "--data_dir", str(tmp_path)])
     out, err = capsys.readouterr()
     assert [line.split() for line in out.splitlines()] == [
         ["done", "100.0", "%", str(tmp_path / "by-hand")],
         "1 done; of the 100 runs asked for, 100 are not begun".split()]  # fmt: skip
-    assert err.startswith(f"{tmp_path}/broken/config.json: no run's settings") and err.count("\n") == 1
+    assert err.startswith(f"{tmp_path}/broken: no run's config.json") and err.count("\n") == 1
 
 
 def test_run_that_was_made_by_hand_is_done_once_its_last_checkpoint_is_saved(swept, tmp_path):
