@@ -370,12 +370,12 @@ def demos_figure(task, runs, flags):
 
 
 def trajectories_figure(task, runs, flags):
-    """The successful ones of the first 20 test trials of the run with the highest P_scs, of the paper's algorithm where
-    there is one (Fig. 9)."""
+    """The successful ones of the first 20 test trials of the run with the highest P_scs, of the main group where one of
+    it has been tested (Fig. 9)."""
     tested = [run for run in runs.itertuples()
               if not run.curves.pid and run.curves.trajectories.exists() and run.curves.success >= 0]  # fmt: skip
-    algo = tables.best_column(task, runs).algo if tested else ""
-    best = max(tested, key=lambda run: (run.algo == algo, run.curves.success), default=None)
+    main = main_group(task, runs).index
+    best = max(tested, key=lambda run: (run.Index in main, run.curves.success), default=None)
     if best is None:
         return None
     paths = [path for path in tables.read_paths(best.curves.trajectories)[1] if path["success"]]

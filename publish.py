@@ -367,8 +367,15 @@ def pid_lines(runs):
     return lines
 
 
-BLOCKS = {f"{kind}-{task}": lambda runs, kind=kind, task=task: make_table(kind, task, runs)[1]
-          for kind in (*METRICS, *COMPARED) for task in PRINTED}  # fmt: skip
+def table_lines(kind, task, runs):
+    """A table in Markdown; those of the paper without columns of our own recipes that it does not have."""
+    printed = columns(task)[COLUMN[1:]].values.tolist() if kind in METRICS else []
+    kept = [kind not in METRICS or run.recipe not in tables.OWN_SYMMETRY or [run.num_demos, run.lambda_bc] in printed
+            for run in runs.itertuples()]  # fmt: skip
+    return make_table(kind, task, runs[np.array(kept, bool)])[1]
+
+
+BLOCKS = {f"{kind}-{task}": partial(table_lines, kind, task) for kind in (*METRICS, *COMPARED) for task in PRINTED}
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
     ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines), ("cost", cost_lines),
     ("demonstrator", pid_lines))}  # fmt: skip
