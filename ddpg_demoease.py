@@ -50,7 +50,7 @@ class Flags(logx.RunFlags):
     # length (Table 1; 5 T steps an epoch is ours: the paper does not say)
     epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 25", low=1)
     steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T, robust p2p: 1000", low=1)
-    max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
+    max_ep_len: int | None = flag(None, "T of own episodes; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 1; start_steps and update_after: ours)
     update_every: int | None = flag(None, "N_up, steps between blocks of N_up * updates_per_step updates; T/20", low=1)
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T, robust: 0", low=0)
@@ -99,8 +99,8 @@ def recipe_defaults(task, recipe, max_ep_len=None, clone_iters=None):
     T = max_ep_len or TASKS[task].horizon
     defaults = TASK_DEFAULTS[task] | dict(max_ep_len=TASKS[task].horizon, steps_per_epoch=5 * T)
     defaults |= dict(update_every=max(1, T // 20), start_steps=2 * T, update_after=T)
-    defaults |= PAPER if recipe == "paper" else ROBUST | ROBUST_TASK.get(task, {})
-    return defaults | ({"keep_clone": 0.0} if clone_iters == 0 else {})
+    defaults |= PAPER if recipe == "paper" else (ROBUST | ROBUST_TASK.get(task, {}))
+    return defaults | ({"keep_clone": 0.0} if clone_iters == 0 else {})  # without a clone there is none to stay near
 
 
 def resolve(flags):
@@ -122,8 +122,9 @@ def resolve(flags):
 class ReplayBuffer:
     """Transitions (s, a, r, s', discount) in a ring; the value of s' counts for discount = gamma^n (1 - zeta).
 
-    Here the symmetry meets the data: `gas.seen` turns each state as it is stored; of a sample, `so2` turns each row by
-    a random angle, `mirror` exchanges left and right in every other.
+    Here a symmetry meets the data (but `gas`, which has mapped the demonstrations before): `gas.seen` turns each state
+    as it is stored; of a sample, `so2` turns each row by a random angle, `mirror` exchanges left and right in every
+    other.
     """
 
     def __init__(self, obs_dim, size, symmetry):

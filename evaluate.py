@@ -46,8 +46,8 @@ from logx import flag
 
 HERE = Path(__file__).resolve().parent
 RESULTS, RUNS = HERE / "data/results", (HERE / "data/runs", Path("data/runs"))  # where runs are looked for
-FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs train with
-VALIDATION = 10_000  # trials from here on are for choosing; 0 ... 499 are the published ones and choose nothing
+FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs usually train with
+VALIDATION = 10_000  # trials from here on are for choosing; 0 ... 499, and those from 50,000 on, choose nothing
 PATHS = 20  # trials whose TCP paths are kept
 COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm",
            "goal_theta", "goal_rho", "goal_z"]  # fmt: skip
@@ -257,8 +257,8 @@ def over_trials(trials):
 
 
 def over_seeds(values):
-    """(mean, low, high) of the mean of values (seeds,) by Student's t, which a bootstrap of so small samples does not
-    cover. NaN values (N/A) are left out; low and high are NaN of a single one."""
+    """(mean, low, high) of the mean of values (seeds,) by Student's t: a bootstrap of so few would be too narrow. NaN
+    values (N/A) are left out; low and high are NaN of a single one."""
     return _student(*_mean(values))
 
 
@@ -310,7 +310,8 @@ def print_table(results, versus=None):
     def cells(found):
         texts = []
         for (_, d, width), (mean, low, high) in zip(CELLS.values(), found.values(), strict=True):
-            texts.append((f"{mean:.{d}f} [{low:.{d}f}, {high:.{d}f}]" if mean == mean else "N/A").ljust(width))
+            ends = f"[{low:.{d}f}, {high:.{d}f}]" if low == low else "[-]"  # a single trial has none
+            texts.append((f"{mean:.{d}f} {ends}" if mean == mean else "N/A").ljust(width))
         return "  " + " ".join(texts)
 
     print("  " + " ".join(heading.ljust(width) for heading, _, width in CELLS.values()))
@@ -323,6 +324,8 @@ def print_table(results, versus=None):
         if name != versus:
             print(name, f"  minus {versus}, the same trials:", cells(paired(results[name], results[versus])), sep="\n")
     print("[ ]: 95 % interval over trials: Wilson's of P_scs, else Student's t, over the successful trials")
+    if versus:
+        print("of differences: Student's t over pairs of trials; all but P_scs of those that both succeeded in")
 
 
 def study(task, first_trial=0, start=None, horizon=None):
@@ -332,10 +335,14 @@ def study(task, first_trial=0, start=None, horizon=None):
     return "-".join(parts + ([f"first_trial_{first_trial}"] if first_trial else []))
 
 
+def path_of(folder, what=""):
+    """The table of a study in `folder`: evaluation.csv, of another study `what` evaluation-<what>.csv."""
+    return folder / f"evaluation{what and '-' + what}.csv"
+
+
 def write(folder, rows, trajectories, what=""):
-    """evaluation.csv and trajectories.npz in `folder`, of another study `what` evaluation-<what>.csv; a published file
-    stays as it is."""
-    path = folder / f"evaluation{what and '-' + what}.csv"
+    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published file stays as it is."""
+    path = path_of(folder, what)
     if path.with_name(f"{path.name}.gz").exists():
         print(f"{path}.gz: published, stays as it is")
         return
@@ -356,9 +363,11 @@ def show(agents, numbers, path=None, **settings):
     if path:
         film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers})
         print(f"wrote {path}")
-    for i in () if path else numbers:
-        row, *_ = trial(*made[next(iter(made))], i)
-        print(f"trial {i}: {row['failure'] or 'success'} after {row['length']} steps")
+    else:
+        (agent,) = made.values()
+        for i in numbers:
+            row, *_ = trial(*agent, i)
+            print(f"trial {i}: {row['failure'] or 'success'} after {row['length']} steps")
     for env, _ in made.values():
         env.close()
 
@@ -397,7 +406,9 @@ def check(flags):
     for wrong, message in (
         (not (flags.pid or flags.runs), "RUN: name run folders (--list prints some), or --pid --task T"),
         (flags.pid and not flags.task, f"--pid: needs --task, one of {', '.join(TASKS)}"),
-        (of_pid and not flags.pid, f"--task, --gains, --out {of_pid}: go with --pid; a run has its own"),
+        (of_pid and not flags.pid, "--task, --gains, --out: go with --pid; a run has its own"),
+        (flags.out and flags.out.exists() and not flags.out.is_dir(), f"--out {flags.out}: must be a folder"),
+        (flags.versus and flags.versus in flags.runs, f"--versus {flags.versus}: must be another than RUN"),
         (flags.show and not (flags.gif or flags.watch), "--show: goes with --gif or --watch; --first_trial else"),
         (flags.watch and len(flags.runs) + flags.pid + bool(flags.versus) > 1, "--watch: one agent at a time"),
     ):
@@ -414,7 +425,23 @@ def check(flags):
     tasks = sorted({task for task, _ in agents.values()})
     if len(tasks) > 1 and (flags.versus or flags.gif):
         raise logx.BadInput(f"--versus, --gif: the agents must be of one task, not {' and '.join(tasks)}")
+    for task, source in agents.values():
+        folder = folder_of(source, flags)
+        if folder is None or flags.gif or flags.watch:
+            continue
+        path = path_of(folder, study(task, flags.first_trial, flags.start, flags.horizon))
+        there = len(path.read_text(errors="replace").splitlines()) - 1 if path.is_file() else 0
+        if there > flags.trials:
+            raise logx.BadInput(f"--trials {flags.trials}: would replace the {there} of {path}; ask for as many, or "
+                                "move the file")  # fmt: skip
     return agents
+
+
+def folder_of(source, flags):
+    """Where the trials of a policy, or of the PID, are written; None of the PID without --out."""
+    if isinstance(source, Path):
+        return source.parent if source.suffix == ".pt" else source
+    return flags.out
 
 
 def main():
@@ -430,15 +457,13 @@ def main():
             return show(agents, numbers, flags.gif, **settings)
         for name, (task, source) in agents.items():
             found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
-            folder = flags.out
-            if isinstance(source, Path):
-                folder = source.parent if source.suffix == ".pt" else source
-            elif folder and not (folder / "evaluation.csv.gz").exists():
+            folder = folder_of(source, flags)
+            if folder == flags.out and not (folder / "evaluation.csv.gz").exists():
                 folder.mkdir(parents=True, exist_ok=True)
                 config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
                 logx.atomic_write(folder / "config.json", json.dumps(config, indent=1))
             results[name] = found[0]
-            if folder:
+            if folder is not None:
                 write(folder, *found, study(task, flags.first_trial, **settings))
     except OSError as error:
         raise logx.BadInput(f"{error.filename or flags.gif or name}: cannot be written ({error.strerror})") from None

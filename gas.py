@@ -147,7 +147,7 @@ def partition_of(obs, K=4):
     task = _TASK[obs.shape[-1]]
     P_e = obs[..., INDEX[task]["P_g"]] - obs[..., INDEX[task]["e"]]
     theta = xp.arctan2(P_e[..., 1], P_e[..., 0])
-    k = xp.floor(theta / (2 * math.pi / K) - TASKS[task].sector_start + 0.5) % K
+    k = xp.floor(theta / (2 * math.pi / K) - TASKS[task].sector_offset + 0.5) % K
     return k.astype(np.int64) if xp is np else k.long()
 
 

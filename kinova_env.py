@@ -30,7 +30,7 @@ class Task:
     horizon: int  # T, steps (Tables 1 and 2)
     speed: float  # fraction of the joint velocity limits that |a| = 1 asks for
     cube: str  # "" (none), "obstacle" (P2P-O) or "object" (P&P)
-    sector_start: float  # demonstration start angle, in units of 2*pi/K from the sector's number k
+    sector_offset: float  # sector k's demonstrations start at the angle (k + sector_offset) * 2*pi/K
     test_theta: float  # start angle of the test study
 
 
@@ -304,7 +304,7 @@ class KinovaEnv(gymnasium.Env):
 
     def sector_start(self, partition):
         """Start angle in rad of demonstration sector k, which is also the sector's centre (Sec. 4.1)."""
-        return (partition + self.row.sector_start) * 2 * math.pi / self.partitions
+        return (partition + self.row.sector_offset) * 2 * math.pi / self.partitions
 
     def _draw(self, options):
         """One draw of (start posture (4,), goal (3,), cube (3,) or None); explicit options are taken as they are."""
@@ -421,7 +421,8 @@ class KinovaEnv(gymnasium.Env):
         pybullet.resetBasePositionAndOrientation(self._cube, self.cube, turned, self._client)
 
     def step(self, action):
-        """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five; raises ValueError where it is none."""
+        """action (4,) in [-1, 1], clipped to it. Returns Gymnasium's five. Raises ValueError unless these are four
+        numbers, none NaN."""
         if self.goal is None:
             raise RuntimeError(f"step() {'after close()' if self._client is None else 'before reset()'}")
         action = action.tolist() if isinstance(action, np.ndarray) else list(action)  # a copy: it is kept
@@ -445,11 +446,12 @@ class KinovaEnv(gymnasium.Env):
         if self.row.cube == "object":
             if not self.grasped:
                 first_grasp = self.grasped = self._grasps()
-                to_go = distance if self.grasped else math.dist(self.cube, self.tcp)
             if self.grasped:
                 self.cube = list(self.tcp)
                 if self.render_mode:
                     self._move_cube(-self.q[0])
+            else:
+                to_go = math.dist(self.cube, self.tcp)
         success = distance < EPSILON and (self.grasped or self.row.cube != "object")
         collision = self._collision()
         # Eq. 11

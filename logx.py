@@ -215,6 +215,8 @@ def fill_in(flags, defaults, algo):
     for key in ("gains", "demo_noise") if flags.demos is not None else ():
         if getattr(flags, key) is not None:
             raise BadInput(f"--{key} {getattr(flags, key)}: is of own recordings, and does not go with --demos")
+    if flags.demos is not None and flags.num_demos == 0:
+        raise BadInput(f"--demos {flags.demos}: --num_demos 0 takes none of them; at least 1 is allowed, or no --demos")
     recipe = dataclasses.replace(type(flags)(task=flags.task, recipe=flags.recipe), **defaults)
     flags = dataclasses.replace(flags, **{key: v for key, v in defaults.items() if getattr(flags, key) is None})
     flags.own_length = flags.epochs == recipe.epochs

@@ -321,7 +321,7 @@ def draw_paths(task, paths, text):
     sector."""
     if not paths:
         return None
-    first = TASKS[task].sector_start * math.pi / 2  # S_1's start angle, the centre of its sector
+    first = TASKS[task].sector_offset * math.pi / 2  # S_1's start angle, the centre of its sector
     borders, (low, high) = first + math.pi / 4 + math.pi / 2 * np.arange(4), Z
     figure = Figure(figsize=(5.4, 3.1), layout="constrained")
     plan, space = figure.add_subplot(1, 2, 1), figure.add_subplot(1, 2, 2, projection="3d")

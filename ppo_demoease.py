@@ -51,7 +51,7 @@ class Flags(logx.RunFlags):
     # length (Table 2)
     epochs: int = flag(50, "N_ep", low=1)
     steps_per_epoch: int = flag(4000, "N_o, the agent's own steps in B_o", low=1, high=10_000_000)
-    max_ep_len: int | None = flag(None, "T; p2p 400, p2po 500, pnp 800", low=1)
+    max_ep_len: int | None = flag(None, "T of own episodes; p2p 400, p2po 500, pnp 800", low=1)
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
     demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch; N_demos / 5, robust: N_demos", low=1)
     train_iters: int = flag(20, "N_up, updates an epoch at most", low=1)

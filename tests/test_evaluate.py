@@ -427,6 +427,13 @@ def test_other_settings_are_written_to_a_file_of_their_own(run_folder, main, wor
     assert (run_folder / "trajectories.npz").exists() == (not what)
 
 
+def test_a_study_of_more_trials_is_not_replaced_by_one_of_fewer(run_folder, main, capsys):
+    for trials, code in ((2, 0), (1, 2), (3, 0)):
+        assert main(run_folder, "--trials", trials) == code
+    assert "--trials 1: would replace the 2 of" in capsys.readouterr().err
+    assert (run_folder / "evaluation.csv").read_text().count("\n") == 4
+
+
 def test_a_published_study_stays_as_it_is_and_another_one_is_written_beside_it(run_folder, main, capsys):
     (run_folder / "evaluation.csv.gz").write_bytes(b"as it was")
     assert main(run_folder, "--trials", 1) == 0 and "stays as it is" in capsys.readouterr().out
@@ -505,6 +512,8 @@ BAD = {
     "a window without a display": (["{run}", "--watch"], "--watch"),
     "trials to show in no film": (["{run}", "--show", "1"], "--show"),
     "a film and a window": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
+    "the trials' folder is a file": (["--pid", "--task", "p2p", "--out", "{run}/policy.pt"], "--out"),
+    "a run and itself": (["{run}", "--versus", "{run}"], "--versus"),
     "a folder that is a file": (["--pid", "--task", "p2p", "--trials", "1", "--out", "{run}/policy.pt/a"], "policy.pt"),
 }
 

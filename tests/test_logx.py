@@ -166,6 +166,8 @@ def test_demonstrations_of_a_file_are_named_by_it_and_not_by_how_they_would_be_r
     for given in ({"gains": "fast"}, {"demo_noise": 0.2}):
         with pytest.raises(BadInput, match=f"--{next(iter(given))} .*does not go with --demos"):
             filled(demos="some/file.npz", **given)
+    with pytest.raises(BadInput, match="--demos some/file.npz: --num_demos 0 takes none"):
+        filled(demos="some/file.npz", num_demos=0)
     flags = filled(demos="some/file.npz")
     assert (flags.variant, flags.gains, flags.demo_noise) == ("demos=file.npz", None, None)
 
