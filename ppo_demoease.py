@@ -7,8 +7,8 @@
 
 `--recipe paper`, the default, is the algorithm as published (Table 2); where
 table and algorithm are silent, the values are Spinning Up's or, where
-DIFFERENCES.md says so, ours. `--recipe robust` changes a few things, each a flag
-of its own. What they reach, in how many minutes, with how many seeds:
+DIFFERENCES.md says so, ours. `--recipe robust` changes a few things, each a
+flag of its own. What they reach, in how many minutes, with how many seeds:
 data/results/README.md. A run is a folder, DATA_DIR/NAME (logx.py).
 """
 
