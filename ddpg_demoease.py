@@ -325,7 +325,7 @@ class Learner:
             ((a_hat - a_demo) ** 2).sum() / (a_demo**2).sum(),
         )]  # fmt: skip
 
-    def clone(self, B_d):
+    def clone(self, B_d, stop_signals=()):
         """Before the first step: observations are normalised by B_d, then clone_iters updates of the actor on B_d, L_BC
         with M = 1, at the critic's rate, which falls to 0 (a cosine). Its target begins as this clone too."""
         f, net = self.flags, self.net
@@ -336,6 +336,8 @@ class Learner:
         optimizer = torch.optim.Adam(self.mu, lr=f.q_lr, fused=True)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
+            if stop_signals:
+                raise KeyboardInterrupt("stopped while cloning; --resume begins it anew")
             s, a, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a, net.pi(s), torch.ones_like(a[:, 0]))
             optimizer.zero_grad()
@@ -399,7 +401,7 @@ def loop(f, run):
             store_demonstrations(demos, B_o, B_d, f)
     run.begin(demo_env_steps)
     if demos:
-        learner.clone(B_d)
+        learner.clone(B_d, run.stop_signals)
 
     while t < run.total_steps:
         # act

@@ -201,7 +201,7 @@ def recorded(cls, asked):
         fields = {field.name for field in dataclasses.fields(cls)}
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
         if missing := fields - set(before):
-            raise ValueError(f"its config.json lacks {', '.join(sorted(missing))}")
+            raise ValueError(f"of {config.get('algo')}; its config.json lacks {len(missing)} flags of this script")
     except (OSError, ValueError, AttributeError) as error:
         raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
     where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}
@@ -485,7 +485,7 @@ class RunFolder:
         self._shown = ["eval_success", "epoch", "env_steps", "EpRet", "Success", "EpLen"]
         self._shown += [c for c in self.columns["progress"][len(PROGRESS) : -2] if c not in ("L_O", "L_C", "L_A")]
         self._say(f"{self.folder}: {self.total_steps:,} steps, {self._log['demo_env_steps']:,} of the demonstrator")
-        heads = {"eval_success": "test %", "Success": "train %", "env_steps": "steps"}
+        heads = {"eval_success": "valid %", "Success": "train %", "env_steps": "steps"}
         self._say(" ".join(f"{heads.get(c, c):>{max(7, len(c))}}" for c in self._shown))
 
     def _say(self, text):

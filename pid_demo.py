@@ -5,7 +5,7 @@
     python pid_demo.py --task p2p --trials 500 --stage test
     python pid_demo.py --task p2p --record 100 --out demos.npz
     python pid_demo.py --inspect demos.npz          # what a file holds
-    python ddpg_demoease.py --demos demos.npz       # trains with it
+    python ddpg_demoease.py --recipe robust --demos demos.npz       # trains with it
 
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's

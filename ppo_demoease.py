@@ -275,7 +275,7 @@ class Learner:
             s[half], a[half] = gas.mirror(s[half], a[half])
         return i, *(x.to(self.flags.device) for x in (s, a, r))
 
-    def clone(self, B_d):
+    def clone(self, B_d, stop_signals=()):
         """Before the first step: clone_iters updates on B_d alone, L_BC with M = 1 for the actor, L_C on the
         demonstrated rewards-to-go for the critic, both at the critic's rate, which falls to 0 (a cosine)."""
         f, net = self.flags, self.net
@@ -284,6 +284,8 @@ class Learner:
         optimizer = self.adam(f.vf_lr, f.vf_lr)
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, f.clone_iters)
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
+            if stop_signals:
+                raise KeyboardInterrupt("stopped while cloning; --resume begins it anew")
             i, s, a, r = self.demo_batch(B_d)
             loss = loss_BC(a, net.mu(s), torch.ones_like(r)) + loss_C(net.V(s), R[i].to(f.device))
             optimizer.zero_grad()
@@ -409,7 +411,7 @@ def loop(f, run):
         open_epoch()
     run.begin(demo_env_steps)
     if demos and f.clone_iters:
-        learner.clone(B_d)
+        learner.clone(B_d, run.stop_signals)
 
     while t < run.total_steps:
         # act

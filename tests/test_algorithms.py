@@ -187,6 +187,25 @@ def test_a_run_that_is_interrupted_and_resumed_equals_one_that_never_stopped(scr
         assert curves(again.folder) == curves(whole.folder)
 
 
+def test_a_run_that_is_stopped_while_it_clones_ends_at_once_and_a_resume_begins_it_anew(
+    script, world, tmp_path, monkeypatch
+):
+    flags, batches = RESUMED["robust"] | dict(clone_iters=50), []
+    whole, loss_BC = world("whole", **flags), script.loss_BC
+
+    def interrupted(*args):
+        batches.append(args)
+        interrupt_at(3)(len(batches))
+        return loss_BC(*args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(script, "loss_BC", interrupted)
+        cut = scripted_run(script, tmp_path, "a", **flags)
+    assert isinstance(cut.error, KeyboardInterrupt) and "--resume begins it anew" in str(cut.error)
+    assert (len(batches), cut.steps) == (3, [])
+    assert curves(world("a", resume=True, **flags).folder) == curves(whole.folder)
+
+
 def test_a_finished_run_goes_on_with_more_epochs_as_if_asked_for_them_at_first(script, world, capsys):
     """--resume FOLDER --epochs N: all other flags are those on record."""
     whole, first = world("whole"), world("a", epochs=2)

@@ -493,7 +493,7 @@ def test_demonstrations_open_the_early_epochs_until_B_d_is_full(flags, filled, w
 
 def test_cloning_comes_before_the_first_step_from_the_first_B_d(world, epochs, monkeypatch):
     seen, clone = [], ppo.Learner.clone
-    monkeypatch.setattr(ppo.Learner, "clone", lambda self, B_d: seen.append(B_d.filled) or clone(self, B_d))
+    monkeypatch.setattr(ppo.Learner, "clone", lambda self, B_d, *rest: seen.append(B_d.filled) or clone(self, B_d))
     plain = world("plain", epochs=1, demos_per_epoch=2, **DEMONSTRATED)
     run = world("a", epochs=1, demos_per_epoch=2, clone_iters=3, **DEMONSTRATED)
     assert seen == [LENGTHS[1]] and not np.array_equal(run.steps[0].a, plain.steps[0].a)
