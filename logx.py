@@ -201,7 +201,7 @@ def recorded(cls, asked):
         fields = {field.name for field in dataclasses.fields(cls)}
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
         if missing := fields - set(before):
-            raise ValueError(f"of {config.get('algo')}; its config.json lacks {len(missing)} flags of this script")
+            raise ValueError(f"its config.json, of {config.get('algo')}, lacks {len(missing)} of this script's flags")
     except (OSError, ValueError, AttributeError) as error:
         raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
     where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}

@@ -237,7 +237,7 @@ def findings_lines(runs):
             continue
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
         if claim == "PID" and theirs_mean >= CEILING and high > -MARGIN:
-            verdict = "no room above it" + ", and below" * (high < 0)
+            verdict = "no room above it" + ", and below" * bool(high < 0)
         if claim == "quick":
             both = np.mean([sum(c.evaluations[""].success * theirs[0].evaluations[""].success) for c in ours])
             compared += f", {both:.0f} that both succeed in"

@@ -393,7 +393,7 @@ def test_the_table_is_said_unless_quiet_and_standard_error_is_silent_where_it_is
     title, heads, row = out.splitlines()
     assert title == f"{run.folder}: 200 steps, 1,234 of the demonstrator"
     assert dict(zip(heads.replace(" %", "%").split(), row.split(), strict=True)) == {
-        "test%": "–", "epoch": "1", "steps": "50", "EpRet": "-16.67", "train%": "100", "EpLen": "50"}  # fmt: skip
+        "valid%": "–", "epoch": "1", "steps": "50", "EpRet": "-16.67", "train%": "100", "EpLen": "50"}  # fmt: skip
 
 
 def test_a_resume_cuts_the_curves_back_to_the_checkpoint_and_goes_on_from_there(stopped):
@@ -618,7 +618,7 @@ def test_resume_of_a_folder_takes_the_flags_of_the_run_there_and_what_is_asked_n
 
 @pytest.mark.parametrize("name, data, says", [
     ("config.json", None, "No such file"), ("config.json", b"{", "Expecting"),
-    ("config.json", b"[]", "no attribute"), ("config.json", b"{}", "config.json lacks act_noise"),
+    ("config.json", b"[]", "no attribute"), ("config.json", b"{}", "config.json, of None, lacks"),
 ])  # fmt: skip
 def test_resume_of_a_folder_without_a_run_to_go_on_with_is_refused(stopped, name, data, says):
     spoil(name, data)(stopped)
