@@ -458,7 +458,7 @@ def main():
         for name, (task, source) in agents.items():
             found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
             folder = folder_of(source, flags)
-            if folder == flags.out and not (folder / "evaluation.csv.gz").exists():
+            if flags.out and source in pid_demo.GAINS and not (folder / "evaluation.csv.gz").exists():
                 folder.mkdir(parents=True, exist_ok=True)
                 config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
                 logx.atomic_write(folder / "config.json", json.dumps(config, indent=1))

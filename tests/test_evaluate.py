@@ -442,6 +442,12 @@ def test_a_published_study_stays_as_it_is_and_another_one_is_written_beside_it(r
     assert (run_folder / "evaluation-horizon_9.csv").exists()
 
 
+def test_trials_of_the_demonstrator_are_printed_where_no_folder_is_given(tmp_path, main, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main("--pid", "--task", "p2p", "--gains", "fast", "--trials", 1) == 0
+    assert capsys.readouterr().out.splitlines()[1] == "PID, fast gains, p2p" and not list(tmp_path.iterdir())
+
+
 def test_trials_of_the_demonstrator_are_kept_where_a_folder_is_given(tmp_path, main, capsys):
     out = tmp_path / "new" / "pid-p2p-fast"
     assert main("--pid", "--task", "p2p", "--gains", "fast", "--trials", 2, "--out", out) == 0
