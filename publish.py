@@ -139,7 +139,7 @@ def publish(sources):
     rows, trained = [], {}
     for path in sorted(results.glob("[!.]*/config.json")):
         for run in tables.find_runs([path.parent])[0].to_dict("records"):
-            success, last = run["curves"].success, run["curves"].validation[-1:].max() / 100
+            success, last = run["curves"].success, run["curves"].validation.iloc[-1:].max() / 100
             rows.append({"name": path.parent.name} | run | {
                 "env_steps": run["steps"], "finished": int(run["finished"]), "eval_success": last,
                 "P_scs_percent": success, "git_commit": run["commit"]})  # fmt: skip
