@@ -355,13 +355,13 @@ def write(folder, rows, trajectories, what=""):
         logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
 
 
-def show(agents, numbers, path=None, **settings):
+def show(agents, numbers, path=None, quiet=False, **settings):
     """Trials of agents, {name: (task, source)}, side by side into a GIF or MP4 at `path`; of one agent in a window
     where it is None. settings: start, horizon."""
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
     made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
-        film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers})
+        film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers}, quiet=quiet)
         print(f"wrote {path}")
     else:
         (agent,) = made.values()
@@ -379,7 +379,7 @@ def after_training(folder, task, gains, quiet):
     found = {name: run_trials(task, source, 100, quiet=quiet) for name, source in agents.items()}
     write(folder, *found[str(folder)])
     print_table({name: rows for name, (rows, _) in found.items()})
-    show({str(folder): (task, folder)}, range(6), folder / "agent.gif")
+    show({str(folder): (task, folder)}, range(6), folder / "agent.gif", quiet)
 
 
 def print_agents():

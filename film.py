@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 import logx
 
@@ -168,17 +169,19 @@ def check(path, watch):
             raise logx.BadInput(message)
 
 
-def frames(agents, episodes, every=EVERY):
+def frames(agents, episodes, every=EVERY, quiet=True):
     """The pictures (height, width, 3) uint8 of episodes, one in `every` steps, the agents' side by side, with a clock
     and, at an agent's end, a green border for success or a red one.
 
-    agents: {name: (an env with render_mode "rgb_array", act(obs))}; episodes: {what is written: seed}.
+    agents: {name: (an env with render_mode "rgb_array", act(obs))}; episodes: {what is written: seed}; quiet: without a
+    progress bar.
     """
     from PIL import Image, ImageDraw, ImageFont
 
     font, names = ImageFont.load_default(14), short(agents)
     dt = 1 / next(iter(agents.values()))[0].metadata["render_fps"]
-    for title, seed in episodes.items():
+    bar = tqdm(episodes.items(), "filming", unit="episode", disable=quiet or None, leave=False)  # on a terminal
+    for title, seed in bar:
         obs = {name: env.reset(seed=seed)[0] for name, (env, _) in agents.items()}
         shown, t = dict.fromkeys(agents), 0
         while obs:  # those that have ended keep their last picture
@@ -203,7 +206,7 @@ def frames(agents, episodes, every=EVERY):
         yield from [whole] * 9  # a rest at the end
 
 
-def film(agents, path, episodes, every=EVERY):
+def film(agents, path, episodes, every=EVERY, quiet=False):
     """Writes `frames` to a GIF, or to an MP4 (with imageio's ffmpeg) where `path` says so, in real time."""
     from PIL import Image
 
@@ -213,11 +216,11 @@ def film(agents, path, episodes, every=EVERY):
         import imageio
 
         with imageio.get_writer(file, format="mp4", fps=fps, macro_block_size=None) as video:
-            for one in frames(agents, episodes, every):
+            for one in frames(agents, episodes, every, quiet):
                 video.append_data(one)
 
     def gif(file):
-        pictures = [Image.fromarray(one) for one in frames(agents, episodes, every)]
+        pictures = [Image.fromarray(one) for one in frames(agents, episodes, every, quiet)]
         sample = pictures[0].copy()  # one palette, that of the first picture and of the borders, makes a small file
         for n, colour in enumerate((GREEN, RED)):
             sample.paste(rgb(colour), (20 * n, 0, 20 * n + 20, 20))

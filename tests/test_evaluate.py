@@ -479,7 +479,7 @@ def test_agents_are_filmed_side_by_side_on_the_trials_chosen(run_folder, tmp_pat
 def test_quick_runs_end_with_a_table_beside_the_demonstrator_the_trials_and_a_film(run_folder, monkeypatch, capsys):
     run_trials, filmed = evaluate.run_trials, []
     monkeypatch.setattr(evaluate, "run_trials", lambda task, source, n, quiet: run_trials(task, source, n // 50))
-    monkeypatch.setattr(evaluate.film, "film", lambda agents, path, episodes: filmed.append((path, episodes)))
+    monkeypatch.setattr(evaluate.film, "film", lambda agents, path, episodes, quiet: filmed.append((path, episodes)))
     evaluate.after_training(run_folder, "p2p", None, quiet=True)
     out = capsys.readouterr().out.splitlines()
     assert out[1] == str(run_folder) and out[4] == "PID, fast gains" and out[3].startswith("  2 trials")
