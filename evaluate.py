@@ -89,7 +89,9 @@ class Policy:
         import torch  # here and below: seconds, which tables and figures are spared
 
         self.task = stored["task"]
-        self.symmetry = stored["symmetry"]
+        self.symmetry, output = stored["symmetry"], stored["output"]
+        if self.symmetry not in gas.SYMMETRIES or output not in ("tanh", "linear"):
+            raise ValueError(f"symmetry {self.symmetry}, output {output}")
         self.grasp_input = bool(stored.get("grasp_input"))
         sizes = stored["sizes"]
         if (sizes[0] - self.grasp_input, sizes[-1]) != (OBS_DIM[self.task], 4):
@@ -100,7 +102,7 @@ class Policy:
                 layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
         net = torch.nn.Sequential(*layers[:-1])
         net.load_state_dict(stored["weights"], assign=True)
-        self.net = torch.nn.Sequential(net, torch.nn.Tanh() if stored["output"] == "tanh" else torch.nn.Identity())
+        self.net = torch.nn.Sequential(net, torch.nn.Tanh() if output == "tanh" else torch.nn.Identity())
 
     def __call__(self, obs):
         import torch
@@ -263,9 +265,10 @@ def over_seeds(values):
 
 
 def difference(a, b):
-    """(mean of a minus mean of b, low, high) of two groups of seeds by Welch's t; NaN as in over_seeds."""
+    """(mean of a minus mean of b, low, high) of two groups of seeds by Welch's t; low and high are NaN of a single
+    seed, and of seeds that all are the same on both sides."""
     (mean_a, var_a, df_a), (mean_b, var_b, df_b) = _mean(a), _mean(b)
-    variance = var_a + var_b
+    variance = var_a + var_b or math.nan  # without any spread, nothing is known of what other seeds would do
     df = variance**2 / (var_a**2 / df_a + var_b**2 / df_b) if variance > 0 else 1
     return _student(mean_a - mean_b, variance, df)
 
@@ -340,11 +343,18 @@ def path_of(folder, what=""):
     return folder / f"evaluation{what and '-' + what}.csv"
 
 
+def trials_in(path):
+    """Rows of a study's table; 0 where there is none."""
+    return len(path.read_text(errors="replace").splitlines()) - 1 if path.is_file() else 0
+
+
 def write(folder, rows, trajectories, what=""):
-    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published file stays as it is."""
+    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published or larger one stays."""
     path = path_of(folder, what)
-    if path.with_name(f"{path.name}.gz").exists():
-        print(f"{path}.gz: published, stays as it is")
+    published = path.with_name(f"{path.name}.gz")
+    if published.exists() or trials_in(path) > len(rows):
+        print(f"{published}: published, stays as it is" if published.exists() else
+              f"{path}: of {trials_in(path)} trials, stays as it is")  # fmt: skip
         return
     text = io.StringIO()
     table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
@@ -388,9 +398,12 @@ def print_agents():
     for path in (path for place in places for path in sorted(place.glob("**/policy.pt"))):
         tested = "not tested"
         for name, read in (("evaluation.csv", open), ("evaluation.csv.gz", gzip.open)):
-            with contextlib.suppress(OSError), read(path.parent / name, "rt") as file:
-                success = [row["success"] == "1" for row in csv.DictReader(file)]
-                tested = f"{100 * np.mean(success):.1f} % of {len(success)} test trials"
+            with (
+                contextlib.suppress(OSError, EOFError, LookupError, ValueError),
+                read(path.parent / name, "rt") as file,
+            ):
+                if success := [row["success"] == "1" for row in csv.DictReader(file)]:
+                    tested = f"{100 * np.mean(success):.1f} % of {len(success)} test trials"
         print(path.parent.name, f"- {tested}")
         print(f"    {os.path.relpath(sys.executable)} {sys.argv[0]} {os.path.relpath(path.parent)} --watch")
     print("--watch needs a display; --gif agent.gif needs none")
@@ -430,10 +443,18 @@ def check(flags):
         if folder is None or flags.gif or flags.watch:
             continue
         path = path_of(folder, study(task, flags.first_trial, flags.start, flags.horizon))
-        there = len(path.read_text(errors="replace").splitlines()) - 1 if path.is_file() else 0
-        if there > flags.trials:
-            raise logx.BadInput(f"--trials {flags.trials}: would replace the {there} of {path}; ask for as many, or "
-                                "move the file")  # fmt: skip
+        if trials_in(path) > flags.trials:
+            raise logx.BadInput(f"--trials {flags.trials}: would replace the {trials_in(path)} of {path}; ask for as "
+                                "many, or move the file")  # fmt: skip
+    if flags.out and (flags.out / "config.json").exists():
+        asked = {"task": flags.task, "algo": "pid", "gains": flags.gains or "authors"}
+        try:
+            there = json.loads((flags.out / "config.json").read_text(encoding="utf-8"))
+            others = {name: there.get(name) for name in asked} != asked
+        except (OSError, ValueError, AttributeError):
+            others = True
+        if others:
+            raise logx.BadInput(f"--out {flags.out}: holds the config.json of another run; name another folder")
     return agents
 
 

@@ -8,8 +8,8 @@
 
 A run's folder holds what was asked (config.json), its curves (episodes.csv,
 progress.csv), its checkpoint and its policy. What is on disk is always whole:
-files are written beside their place, fsynced and renamed. On a resume the
-curves are cut back to the checkpoint, so that a killed and resumed run equals
+but for the curves, which grow by lines, files are written beside their place,
+fsynced and renamed. On a resume the curves are cut back to the checkpoint, so that a killed and resumed run equals
 one that was never killed.
 """
 
@@ -69,7 +69,7 @@ def run_script(main):
     except NotFinite as error:
         code, message = 3, f"error: {one_line(error)}"
     except KeyboardInterrupt as interrupt:
-        code, message = 130, " ".join(map(str, interrupt.args))
+        code, message = 130, " ".join(map(str, interrupt.args)) or "interrupted"
     except BrokenPipeError:  # the reader of our output has seen enough
         code = 128 + signal.SIGPIPE
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -9,7 +9,7 @@
 
 Without --runs the runs are those in data/results, and in data/runs beside this
 file and in the present folder; runs with flags other than their recipe's stand
-in --table ablations alone then. What the numbers are, and which runs form a
+in --table ablations, partitions, and --figure symmetry, success alone then. What the numbers are, and which runs form a
 group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
@@ -195,7 +195,7 @@ def success_figure(task, runs, flags):
         members = members[members.total_env_steps == members.total_env_steps.max()]
         label = group_label([algo.upper() * (algo != best.algo), *rest, 0])
         if (N, lam) != (best.num_demos, best.lambda_bc):
-            label += f", $N_{{demos}}={N}$" + rf", $\lambda_{{BC}}={lam:g}$" * (lam not in (0, best.lambda_bc))
+            label += f", $N_{{demos}}={N}$" + rf", $\lambda_{{BC}}={lam:g}$" * (lam != (best.lambda_bc if N else 0))
         trials = pd.concat([curves.validation for curves in members.curves], axis=1).sort_index()
         lines[f"{label} ({seeds_label(members)})"] = trials
     if not lines:
@@ -223,17 +223,16 @@ def symmetry_figure(task, runs, flags):
     runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
     runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
     runs = runs[runs.finished & (runs.total_env_steps == runs.total_env_steps.mode().max())]
-    runs = runs.assign(success=[curves.success for curves in runs.curves], real=runs.recorded,
-                       K=[curves.config["partitions"] for curves in runs.curves]).dropna(subset="success")  # fmt: skip
+    runs = runs.assign(success=[curves.success for curves in runs.curves]).dropna(subset="success")
     over_K, over_n = runs[runs.symmetry == "gas"], runs[runs.variant == ""]
-    if over_n.real.nunique() < 2:
+    if over_n.recorded.nunique() < 2:
         return None
-    lines = {"real": dict(list(over_n.groupby("symmetry"))), "K": {}}
-    for fixed, text in (("real", "recorded demonstrations"), ("num_demos", r"$N_{demos}$")):
+    lines = {"recorded": dict(list(over_n.groupby("symmetry"))), "K": {}}
+    for fixed, text in (("recorded", "recorded demonstrations"), ("num_demos", r"$N_{demos}$")):
         counts = over_K.groupby(fixed).K.nunique()
         if counts.max() > 1:  # where most K are
             n = counts[counts == counts.max()].index[0]
-            lines["K"][f"{n} {text}" if fixed == "real" else f"{text[:-1]}={n}$"] = over_K[over_K[fixed] == n]
+            lines["K"][f"{n} {text}" if fixed == "recorded" else f"{text[:-1]}={n}$"] = over_K[over_K[fixed] == n]
     panels = [x for x in lines if lines[x]]
     figure = Figure(figsize=(3.2 * len(panels) + 0.8 * (len(panels) == 1), 3.2), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
@@ -249,12 +248,12 @@ def symmetry_figure(task, runs, flags):
             ax.errorbar(at, mean, (mean - low, high - mean), fmt="none", ecolor=style(i)["color"], elinewidth=0.7)
             single = values.map(len) == 1
             ax.scatter(at[single], mean[single], 4, color="w", zorder=3)
-        texts = {"real": "recorded demonstrations", "K": "number of partitions $K$"}
+        texts = {"recorded": "recorded demonstrations", "K": "number of partitions $K$"}
         ax.set(xscale="log", xlabel=texts[x], ylim=(-2, 102))
         ticks = sorted({value for part in lines[x].values() for value in part[x]})
         ax.set_xticks(ticks, [f"{tick}" for tick in ticks])
         ax.minorticks_off()
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=1 + (x == "real"))
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=1 + (x == "recorded"))
     axes[0].set_ylabel("success in test trials (%)")
     steps = int(over_n.total_env_steps.iloc[0])
     figure.suptitle(f"{TITLES[task]}: {best.algo.upper()} robust, {steps:,} environment steps", fontsize=9)
@@ -268,7 +267,8 @@ def error_figure(task, runs, flags):
     group, panels = main_group(task, runs, flags.recipe), {}
     of_all = named(runs, flags)
     parts = of_all or {column_label(column, "both"): of_column(group, column)
-                       for column in tables.columns(task, group).drop_duplicates(COLUMN).itertuples()}  # fmt: skip
+                       for column in tables.columns(task, group).drop_duplicates(COLUMN).itertuples()
+                       if column.sweep != "pid"}  # fmt: skip
     for label, part in parts.items():
         paths = [c.trajectories for c in part.curves if c.trajectories.exists()]
         if errors := [error for path in paths for error in tables.read_errors(path)]:
@@ -543,6 +543,7 @@ def main(argv=None):
     if flags.all:
         return print("\n".join(draw_all(flags)))
     if flags.report:
+        publish.report([])  # what is wrong with a page is said before anything is written
         names = save_figures(tables.RESULTS, tables.find_runs([tables.RESULTS])[0], flags, (".png",), dpi=130)
         figures = [tables.RESULTS / f"{name}.png" for name in names]
         for path in set(tables.RESULTS.glob("fig-*.png")) - set(figures):

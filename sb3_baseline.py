@@ -112,18 +112,20 @@ def train(flags):
     torch.set_num_threads(1)
     f = resolve(flags)
     with logx.RunFolder(f, f.algo, []) as run:
-        if not run.finished():
-            if run.checkpoint:
+        if run.checkpoint:  # written at the end alone
+            if run.checkpoint["t"] < run.total_steps:
                 raise logx.BadInput(f"--epochs {f.epochs}: a finished run cannot go on; begin a new --name")
-            demos, steps = pid_demo.demonstrations(f)
-            model = make_model(f)
-            if demos:
-                preload(model, demos)
-            run.begin(steps)
-            model.learn(run.total_steps, callback=Record())
-            if model.num_timesteps < run.total_steps:
-                raise KeyboardInterrupt(f"{run.folder}: stopped; --resume begins it anew")
-            run.save({"t": run.total_steps}, pack_policy(model, f.task))
+            print(f"{run.folder}: finished")
+            return run.folder
+        demos, steps = pid_demo.demonstrations(f)
+        model = make_model(f)
+        if demos:
+            preload(model, demos)
+        run.begin(steps)
+        model.learn(run.total_steps, callback=Record())
+        if model.num_timesteps < run.total_steps:
+            raise KeyboardInterrupt(f"{run.folder}: stopped; --resume begins it anew")
+        run.save({"t": run.total_steps}, pack_policy(model, f.task))
     return run.folder
 
 

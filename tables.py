@@ -195,7 +195,8 @@ class Curves:
 
 def find_runs(named=None):
     """(DataFrame of the runs below the named folders, or of the default ones: one row a run, `curves` its Curves;
-    remarks to print). Of one configuration and seed there is one run: the finished, longest, own one."""
+    remarks to print). Of one configuration and seed there is one run: the finished, longest, most tested, own
+    one."""
     rows, remarks = {}, []
     for folder in named or (RESULTS, *RUNS):
         found = sorted(path for path in folder.resolve().rglob("config.json") if not path.parent.name.startswith("."))
@@ -212,9 +213,12 @@ def find_runs(named=None):
     names = ["task", *GROUP, *COLUMN[1:], "K", "recorded", "seed", "commit", "steps", "finished", "own", "curves"]
     types = {"finished": bool, "own": bool, "num_demos": int, "lambda_bc": float}
     runs = pd.DataFrame(rows.values(), columns=names).astype(types)
-    runs = runs.sort_values(["finished", "steps", "own"], ascending=False, kind="stable")
     for _, twins in runs.groupby(["task", *GROUP, *COLUMN[1:], "seed"]):
-        kept, *others = twins.itertuples()
+        if len(twins) == 1:
+            continue
+        twins = twins.assign(trials=[len(curves.evaluations.get("", ())) for curves in twins.curves])
+        by = ["finished", "steps", "trials", "own"]
+        kept, *others = twins.sort_values(by, ascending=False, kind="stable").itertuples()
         copies = kept.commit, kept.steps, kept.curves.folder.name  # of a run and its published copy nothing is said
         told = [x for x in others if x.own == kept.own or (x.commit, x.steps, x.curves.folder.name) != copies]
         remarks += [f"left out: {other.curves.folder}; {kept.curves.folder} is of the same configuration and seed"
@@ -336,6 +340,10 @@ def table(kind, task, runs):
             for what, seeds in measured(kind, members).items():
                 of_group = about | dict(zip(GROUP, group, strict=True)) | {"evaluation": what, "seeds": len(seeds)}
                 of_group["unfinished"] = sum(not run.finished for run, _ in seeds)
+                tested = [
+                    run.curves.evaluations[what] for run, _ in seeds if kind == "test" and what not in (BEST, LATE)
+                ]
+                of_group["trials"] = " ".join(map(str, sorted(set(map(len, tested)))))
                 of_group["commits"] = " ".join(sorted({run.commit[:7] for run, _ in seeds}))
                 for metric, digits in METRICS[kind].items():
                     values = np.array([metrics.get(metric, math.nan) for _, metrics in seeds])
@@ -354,10 +362,10 @@ def table(kind, task, runs):
                                              and group[1] in ("paper", "authors")),  # of the paper's method alone
                         "values": values})  # fmt: skip
         if len(rows) == begun and column.sweep != "other" and (column.sweep != "pid" or kind == "test"):
-            none = dict.fromkeys(GROUP[1:], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
+            none = dict.fromkeys([*GROUP[1:], "trials"], "") | {"evaluation": "", "seeds": 0, "unfinished": 0}
             rows += [about | none | {"metric": m, "paper": getattr(column, m)} for m in METRICS[kind]]
-    names = ["task", "sweep", *COLUMN[1:], *GROUP, "evaluation", "seeds", "unfinished", "metric", "paper", "mean",
-             "low", "high", "interval", "na_seeds", "paper_outside", "commits", "values"]  # fmt: skip
+    names = ["task", "sweep", *COLUMN[1:], *GROUP, "evaluation", "seeds", "trials", "unfinished", "metric", "paper",
+             "mean", "low", "high", "interval", "na_seeds", "paper_outside", "commits", "values"]  # fmt: skip
     return pd.DataFrame(rows, columns=names)
 
 
@@ -392,10 +400,10 @@ def table_lines(kind, rows):
             texts = []
             for cell in cells.itertuples():
                 text = between(cell.mean, cell.low, cell.high, digits[cell.metric]) + " *" * int(cell.paper_outside)
-                if cell.na_seeds and what not in (BEST, LATE):
-                    text = "N/A" if cell.na_seeds == seeds else f"{text} ({cell.na_seeds:.0f} N/A)"
                 if cell.metric == "T50" and cell.mean == WINDOW:  # the least that the rule can give
                     text = f"<= {WINDOW}"
+                if cell.na_seeds and what not in (BEST, LATE):
+                    text = "N/A" if cell.na_seeds == seeds else f"{text} ({cell.na_seeds:.0f} N/A)"
                 texts.append(text)
             lines.append(["", "", "", group_label(group) + f", {what}" * bool(what), *texts,
                           f"{seeds}" + f" ({unfinished} unfinished)" * bool(unfinished)])  # fmt: skip
@@ -407,13 +415,17 @@ def table_notes(kind, rows):
     notes = ["Ours: the mean over seeds and its 95 % interval by Student's t; as published, * where the paper's lies "
              "outside it."]  # fmt: skip
     if kind == "training":
-        notes += ["[-]: a single seed has none. Our T50 (N/A where R90 <= 0) is not the paper's: DIFFERENCES 56."]
+        notes += ["[-]: a single seed has none. T50 is N/A where R90 <= 0 or half of it is not reached; the paper's "
+                  "rule is another (DIFFERENCES 56)."]  # fmt: skip
     else:
         notes += ["A single seed: its interval over trials (P_scs: Wilson's), which knows nothing of other seeds.",
                   "Evaluations in training, of validation trials: the best one is not the last policy's."]  # fmt: skip
     ours = rows[(rows.seeds > 0) & (rows.algo != "pid")]
     for group, texts in ours.groupby(GROUP, sort=False).commits:
         notes.append(f"Commits of {group_label(group)}: {', '.join(sorted(set(' '.join(texts).split())))}")
+    for group, mixed in ours[ours.trials.str.contains(" ")].groupby(GROUP, sort=False).trials:
+        trials = sorted(set(" ".join(mixed).split()), key=int)
+        notes.append(f"Seeds of {group_label(group)} were tested in {' or '.join(trials)} trials.")
     return [*notes, *undecided(kind, ours)]
 
 

@@ -48,7 +48,9 @@ def saved(folder, policy):
 
 @pytest.fixture
 def run_folder(tmp_path):
-    return saved(tmp_path / "a run", stored())
+    folder = saved(tmp_path / "a run", stored())
+    (folder / "config.json").write_text(json.dumps({"task": "p2p", "algo": "ddpg", "recipe": "robust"}))
+    return folder
 
 
 # ---- one trial -------------------------------------------------------------------------------------------------------
@@ -254,7 +256,8 @@ def test_a_difference_is_welchs():
     a, b = [90.0, 95, 97, math.nan], [60.0, 85, 70, 65, 88]
     welch = stats.ttest_ind(a[:3], b, equal_var=False).confidence_interval()
     assert evaluate.difference(a, b) == pytest.approx((94 - 73.6, welch.low, welch.high))
-    assert evaluate.difference([3, 3], [1, 1]) == (2, 2, 2)
+    for few in ([3], [3, 3]):  # two seeds that are the same show no spread: nothing is known of others
+        assert evaluate.difference(few, [1, 1]) == pytest.approx((2, math.nan, math.nan), nan_ok=True)
     assert evaluate.difference([3], [1, 2]) == pytest.approx((1.5, math.nan, math.nan), nan_ok=True)
 
 
@@ -485,6 +488,10 @@ def test_quick_runs_end_with_a_table_beside_the_demonstrator_the_trials_and_a_fi
     assert out[1] == str(run_folder) and out[4] == "PID, fast gains" and out[3].startswith("  2 trials")
     assert (run_folder / "evaluation.csv").read_text().count("\n") == 3
     assert filmed == [(run_folder / "agent.gif", {f"trial {i}": 1_000_000 + i for i in range(6)})]
+    greater = (run_folder / "evaluation.csv").read_text() + "2,1\n"
+    (run_folder / "evaluation.csv").write_text(greater)
+    evaluate.after_training(run_folder, "p2p", None, quiet=True)
+    assert (run_folder / "evaluation.csv").read_text() == greater
 
 
 def test_the_list_names_each_trained_agent_with_its_success_and_the_command_that_watches_it(
@@ -493,7 +500,6 @@ def test_the_list_names_each_trained_agent_with_its_success_and_the_command_that
     monkeypatch.chdir(tmp_path)
     Path("data/runs").mkdir(parents=True)
     own = saved(Path("data/runs/own"), stored())
-    (own / "config.json").write_text(json.dumps({"task": "p2p", "algo": "ddpg", "recipe": "robust"}))
     evaluate.write(own, [trial_row(1), trial_row(0)], {})
     assert main("--list") == 0
     out = capsys.readouterr().out.splitlines()
@@ -502,6 +508,9 @@ def test_the_list_names_each_trained_agent_with_its_success_and_the_command_that
     for folder in (own, *(Path(os.path.relpath(path.parent)) for path in shipped)):
         assert f"    {python} evaluate.py {folder} --watch" in out
     assert out[out.index(f"    {python} evaluate.py {own} --watch") - 1] == "own - 50.0 % of 2 test trials"
+    for content in ("trial\n0\n", "trial,success\n", "\0"):  # of another kind, of none, of none of ours
+        (own / "evaluation.csv").write_text(content)
+        assert main("--list") == 0 and "own - not tested" in capsys.readouterr().out
 
 
 BAD = {
@@ -519,6 +528,7 @@ BAD = {
     "trials to show in no film": (["{run}", "--show", "1"], "--show"),
     "a film and a window": (["{run}", "--gif", "{tmp}/a.gif", "--watch"], "--gif"),
     "the trials' folder is a file": (["--pid", "--task", "p2p", "--out", "{run}/policy.pt"], "--out"),
+    "the trials' folder is a run": (["--pid", "--task", "p2p", "--out", "{run}"], "--out"),
     "a run and itself": (["{run}", "--versus", "{run}"], "--versus"),
     "a folder that is a file": (["--pid", "--task", "p2p", "--trials", "1", "--out", "{run}/policy.pt/a"], "policy.pt"),
 }

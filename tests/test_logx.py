@@ -191,7 +191,7 @@ def test_a_name_that_is_no_folders_is_refused(name):
     (BadInput("--x 1:\nmust be 2"), 2, "script.py: error: --x 1: must be 2\n"),
     (logx.NotFinite("NaN"), 3, "script.py: error: NaN\n"),
     (KeyboardInterrupt("state saved"), 130, "script.py: state saved\n"),
-    (KeyboardInterrupt(), 130, ""),
+    (KeyboardInterrupt(), 130, "script.py: interrupted\n"),
 ])  # fmt: skip
 def test_a_script_ends_with_an_exit_code_and_at_most_one_line(monkeypatch, capsys, raised, code, line):
     def main():

@@ -44,6 +44,10 @@ def trials(success):
     return HEADER + "".join(f"{i},{won},,0,{3 + i},{10 + i},{20 + i},5,6\n" for i, won in enumerate(success))
 
 
+def of_200(won):
+    return (1,) * won + (0,) * (200 - won)
+
+
 def write_run(folder, returns=(1.0,) * 60, steps=4000, success=None, own=(0,), columns="L_C,Q_mean",
               validated=0.5, **config):  # fmt: skip
     """A run folder like a training script's; `steps`: environment steps after the last epoch; own: success of own
@@ -151,7 +155,10 @@ def test_NA_seeds_are_counted_and_not_averaged(tmp_path):
         write_run(tmp_path / f"runs/{seed}", returns, seed=seed)
     T50 = cell(table(), "T50")
     assert (T50["mean"], T50["na_seeds"]) == (76, 1)
-    assert "76 [-] (1 N/A)" in tables.make_table("training", "p2p", tables.find_runs()[0])[0]
+    write_run(tmp_path / "runs/2", num_demos=80, lambda_bc=1)
+    write_run(tmp_path / "runs/3", [-1.0] * 100, num_demos=80, lambda_bc=1, seed=1)
+    text = tables.make_table("training", "p2p", tables.find_runs()[0])[0]
+    assert "76 [-] (1 N/A)" in text and "<= 50 (1 N/A)" in text
 
 
 def test_no_demonstrations_with_lambda_1_and_the_baseline_are_different_columns(tmp_path):
@@ -282,22 +289,21 @@ def test_partitions_are_compared_with_4_at_as_many_recorded_and_at_as_many_mappe
 
 def test_mapped_demonstrations_may_be_a_margin_worse_than_as_many_recorded_ones(tmp_path):
     for seed in (0, 1):
-        for symmetry, N, success in (("none", 5, (0, 0)), ("none", 20, (1, 1)), ("gas", 20, (1, 1))):
-            write_run(
-                tmp_path / f"runs/{symmetry}{N}-{seed}", symmetry=symmetry, num_demos=N, success=success, seed=seed
-            )
+        for symmetry, N, won in (("none", 5, seed), ("none", 20, 199 + seed), ("gas", 20, 199 + seed)):
+            folder = tmp_path / f"runs/{symmetry}{N}-{seed}"
+            write_run(folder, symmetry=symmetry, num_demos=N, success=of_200(won), seed=seed)
     found = {line[0]: line[3:] for line in publish.findings_lines(tables.find_runs()[0])}
-    assert found[publish.CLAIMS["mapping"]] == ["100.0 and 0.0", "100.0 [-] points", "2 and 2", "*holds*"]
-    assert found[publish.CLAIMS["symmetry"]] == ["100.0 and 100.0", "0.0 [-] points", "2 and 2", "*holds*"]
+    assert found[publish.CLAIMS["mapping"]] == ["99.8 and 0.2", "99.5 [98.0, 100.0] points", "2 and 2", "*holds*"]
+    assert found[publish.CLAIMS["symmetry"]] == ["99.8 and 99.8", "0.0 [-1.5, 1.5] points", "2 and 2", "*holds*"]
 
 
 @pytest.mark.parametrize("ours, verdict", [
-    (((1, 1), (1, 1)), "holds"), (((0, 0), (0, 0)), "does not hold"), (((1, 1), (0, 0)), "cannot be told apart"),
-    (((1, 1),), "")])  # a single seed says nothing  # fmt: skip
+    ((200, 199), "holds"), ((0, 1), "does not hold"), ((200, 0), "cannot be told apart"),
+    ((200,), ""), ((200, 200), "")])  # a single seed says nothing, nor do seeds without a spread  # fmt: skip
 def test_a_finding_is_what_the_interval_of_the_difference_says(tmp_path, ours, verdict):
-    for seed, success in enumerate(ours):
-        write_run(tmp_path / f"runs/{seed}", seed=seed, success=success)
-    write_run(tmp_path / "runs/pid", success=(1, 0), **PID)
+    for seed, won in enumerate(ours):
+        write_run(tmp_path / f"runs/{seed}", seed=seed, success=of_200(won))
+    write_run(tmp_path / "runs/pid", success=of_200(100), **PID)
     found = {line[0]: line[-1] for line in publish.findings_lines(tables.find_runs()[0])}
     assert found["The agent beats its demonstrator"] == (verdict and f"*{verdict}*")
     assert found["The mask matters"] == ""
@@ -315,18 +321,19 @@ def test_plain_runs_are_one_algorithm_whatever_their_lambda_and_trials_never_loo
 
 
 def test_an_agent_is_compared_with_the_pid_that_it_was_shown_of_which_the_success_is_told(tmp_path):
-    for gains, success in (("authors", (1, 0)), ("fast", (1, 1))):
-        write_run(tmp_path / f"runs/pid-{gains}", success=success, **PID | {"gains": gains})
+    for gains, won in (("authors", 100), ("fast", 200)):
+        write_run(tmp_path / f"runs/pid-{gains}", success=of_200(won), **PID | {"gains": gains})
     for seed in (0, 1):
-        for variant, gains in (("", "fast"), ("gains=authors", "authors")):
-            write_run(tmp_path / f"runs/{gains}{seed}", seed=seed, success=(1, 1), variant=variant, gains=gains)
+        for variant, gains, won in (("", "fast", 200), ("gains=authors", "authors", 199 + seed)):
+            folder = tmp_path / f"runs/{gains}{seed}"
+            write_run(folder, seed=seed, success=of_200(won), variant=variant, gains=gains)
     (tmp_path / "runs/pid-authors/evaluation-horizon_600.csv").write_text(trials((1, 1)))
     lines = publish.findings_lines(tables.find_runs()[0])
     assert [line[2:] for line in lines if line[0] == "The agent beats its demonstrator"] == [
         ["ddpg robust mirror 4k steps, and the PID with fast gains in the same trials", "100.0 and 100.0",
          "0.0 [-] points", "2", "*no room above it*"],
         ["ddpg robust mirror gains=authors 4k steps, and the PID with authors gains in the same trials (at the horizon "
-         "600 100.0)", "100.0 and 50.0", "50.0 [-] points", "2", "*holds*"]]  # fmt: skip
+         "600 100.0)", "99.8 and 50.0", "49.8 [46.6, 52.9] points", "2", "*holds*"]]  # fmt: skip
 
 
 def test_seeds_that_all_lie_on_one_side_are_marked_where_chance_seldom_does_that():
@@ -393,6 +400,14 @@ def test_an_own_run_takes_the_published_ones_place_once_it_is_finished_and_that_
     assert runs.curves[0].folder == tmp_path / kept / "a" and "left out" in remarks[0]
 
 
+def test_of_runs_of_one_seed_the_most_tested_counts_and_mixed_numbers_of_trials_are_named(tmp_path):
+    write_run(tmp_path / "results/a", success=(1, 1, 1))
+    write_run(tmp_path / "runs/a", success=(0, 0))
+    write_run(tmp_path / "runs/b", success=(1, 1), seed=1)
+    text = tables.make_table("test", "p2p", tables.find_runs()[0])[0]
+    assert "Seeds of ddpg robust mirror 4k steps were tested in 2 or 3 trials." in text and "100.0 [-]" in text
+
+
 # ---- figures ---------------------------------------------------------------------------------------------------------
 
 
@@ -444,7 +459,9 @@ def test_the_success_figure_has_a_line_a_method_with_the_best_column_no_demonstr
         "SAC sb3 none, $N_{demos}=0$ (1 seed)", "robust mirror (2 seeds)", "robust mirror demos=own.npz (1 seed)",
         "robust mirror, $N_{demos}=0$ (1 seed)"]  # fmt: skip
     assert all(line.get_xydata().tolist() == [[2000, 50]] for line in ax.lines)
-    assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 6
+    write_run(tmp_path / "runs/x", num_demos=80)
+    write_run(tmp_path / "runs/y", num_demos=80, lambda_bc=0)
+    assert len(legend(figure("success", runs=(tmp_path,)).axes[0])) == 8
 
 
 def test_a_task_that_the_paper_does_not_have_has_tables_and_figures_too(tmp_path, monkeypatch):
@@ -499,8 +516,10 @@ def test_an_error_curve_is_over_the_successful_trials_and_each_counts_alike_at_e
     write_run(tmp_path / "runs/a", success=(1, 0, 1))  # 3 and 5 steps from 50 to 5 cm
     write_run(tmp_path / "runs/b", success=(0, 0, 1), num_demos=7)
     write_run(tmp_path / "runs/c", success=(0, 0, 0), num_demos=80, lambda_bc=1)
+    write_run(tmp_path / "runs/d", success=(0, 0, 1), num_demos=0, lambda_bc=0)
     drawn = figure("error")
-    ax, own = (ax for ax in drawn.axes if ax.get_visible())
+    ax, plain, own = (ax for ax in drawn.axes if ax.get_visible())
+    assert plain.get_title().startswith("$N_{demos}=0$, $\\lambda_{BC}=0$")
     assert ax.get_title() == "$N_{demos}=100$, $\\lambda_{BC}=1.8$\n2 of 3 trials, 1 seed" and "=7$" in own.get_title()
     t, mean = ax.lines[0].get_data()
     assert t == pytest.approx([0, 0.02, 0.04, 0.06, 0.08, 0.1])
@@ -645,10 +664,11 @@ def test_only_the_run_of_a_task_and_recipe_that_is_best_in_validation_keeps_its_
             for i, won in enumerate([(1, 1), (1, 0)])]  # fmt: skip
     runs.append(publishable(tmp_path / "runs/2", recipe="paper", success=(0, 0), epochs=3))
     runs.append(publishable(tmp_path / "runs/3", success=(1, 1), variant="n_step=1"))
+    runs.append(publishable(tmp_path / "runs/4", validated=1, lambda_bc=0.1))
     for run in runs:
         publish.publish([run])
     assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
-    assert [row["finished"] for row in index(tmp_path)] == ["1", "1", "0", "1"]
+    assert [row["finished"] for row in index(tmp_path)] == ["1", "1", "0", "1", "1"]
 
 
 def test_a_run_takes_the_place_of_an_older_one_of_the_same_name(tmp_path):
