@@ -63,7 +63,7 @@ def rotate(obs, angle):
 def phi(obs, k, K=4):
     """State map onto the partition k places further round (Eq. 4): the world turned by k * 2*pi/K.
 
-    obs: (..., 22 or 25). phi_0 is the identity, bit for bit, and phi_a of phi_b is phi_(a+b mod K).
+    obs: (..., 22 or 25). phi_0 is the identity, bit for bit; phi_a of phi_b is phi_(a+b mod K), to rounding.
     """
     k = k % K
     return _library(obs)[1] if k == 0 else rotate(obs, k * 2 * math.pi / K)
@@ -116,8 +116,9 @@ def mirror(obs, action):
     """State and action with left and right exchanged: reflected in the arm's plane, or in the world's x-z plane where
     the state is of the world.
 
-    obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Exact
-    but for the 1.35 mm by which the TCP lies beside the arm's plane (kinova_env.SIDE).
+    obs: (..., 22 or 25), also of `canonical` or `cylinder`; action: (..., 4). Returns both, of the same types. Nearly
+    exact: the TCP lies 1.35 mm beside the arm's plane (kinova_env.SIDE), so that e, or q_1, is off by twice that, and
+    the masses of the links are not quite symmetric.
     """
     _, out, index = _library(obs)
     first = [index[name][0] for name in ("angle", "sine", "")]  # q_1, sin q_1, dq_1/dt

@@ -209,8 +209,8 @@ class KinovaEnv(gymnasium.Env):
     | collision | -2 on collision |
     | grasping | 2 at the first grasp (P&P) |
 
-    The cube is grasped once the TCP is within 0.05 m of it and the gripper within 0.3 rad of horizontal and of the
-    azimuth that the cube was drawn at; it then stays in the gripper.
+    The cube is grasped once the TCP is within 0.05 m of it and the gripper's orientation within 0.3 rad of the cube's,
+    which is level and at the azimuth that it was drawn at; it then stays in the gripper.
 
     ## Starting state
     Cylinder coordinates (theta, rho, z) of TCP, goal and cube, tool horizontal and radially outward:
@@ -222,10 +222,11 @@ class KinovaEnv(gymnasium.Env):
     | demo | the start of sector k of K, 0.52, 0.42, each joint +- 0.02 rad | in the sector, [0.4, 0.6), [0.35, 0.55) |
 
     The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. On stage "demo" the
-    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube that cannot
-    be grasped, or lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in
-    collision or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: 0 of 20,000 goals
-    on each stage (of the lowest goals' cubes 60 % can be grasped), some where sectors are narrow (K > 10).
+    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube at
+    whose centre the TCP cannot be with the hand so level (a twelfth of all; two of three of these could be grasped from
+    beside), or that lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in
+    collision or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: none of 20,000 goals
+    on each stage, some where sectors are narrow (K > 10); with an explicit goal that is a ValueError.
 
     ## Episode end
     Terminated: success (norm(e) < 0.05, on P&P with the cube grasped), or collision: `info["collision"]` is "self" for
@@ -328,6 +329,9 @@ class KinovaEnv(gymnasium.Env):
             cube = options.get("object", cube)
             if "object" in options or self._cube_fits(cube):
                 break
+        else:
+            if self.row.cube and "goal" in options:
+                raise ValueError(f"goal {tuple(goal)}: none of {CUBE_DRAWS} cubes drawn beside it can be grasped")
         return start_posture(*start) + jitter, goal, cube
 
     def _cube_fits(self, cube):
@@ -338,11 +342,11 @@ class KinovaEnv(gymnasium.Env):
             return False
         return len(grasp_postures(cartesian(*cube))) > 0
 
-    def _playable(self, goal, cube):
-        """Whether a sampled episode may begin: not at the goal, no collision, and a cube that fits."""
+    def _playable(self, goal, cube, explicit):
+        """Whether an episode may begin: not at the goal, no collision, and a cube that fits or is explicit."""
         if math.dist(tcp(self.q), cartesian(*goal)) < EPSILON or self._collision():
             return False
-        return cube is None or self._cube_fits(cube)
+        return cube is None or explicit or self._cube_fits(cube)
 
     def _check_options(self, options):
         unknown = set(options) - {"partition", "start", "goal", "object"}
@@ -358,14 +362,17 @@ class KinovaEnv(gymnasium.Env):
         for name in ("start", "goal", "object"):
             if name not in options:
                 continue
-            place = np.asarray(options[name], dtype=float)
-            if place.shape != (3,) or not np.all(np.isfinite(place)):
-                raise ValueError(f"{name} {options[name]!r}: must be three finite numbers (theta, rho, z)")
+            try:
+                place = np.asarray(options[name], dtype=float)
+            except (TypeError, ValueError):
+                place = np.empty(0)
+            if place.shape != (3,) or not np.all(np.isfinite(place)) or place[1] < 0:
+                raise ValueError(f"{name} {options[name]!r}: must be three finite numbers (theta, rho >= 0, z)")
             if name == "start":
                 start_posture(*place)
             elif name == "object" and self.row.cube == "object":
                 if not len(grasp_postures(cartesian(*place))):
-                    raise ValueError(f"object {tuple(place)}: no posture of the arm grasps a cube there")
+                    raise ValueError(f"object {tuple(place)}: no posture puts a level hand at its centre")
             elif not len(postures(cartesian(*place))):
                 raise ValueError(f"{name} {tuple(place)}: out of the arm's reach")
 
@@ -390,7 +397,7 @@ class KinovaEnv(gymnasium.Env):
         for _ in range(1 if fixed <= set(options) else 1000):  # explicit options may leave no draw that is playable
             posture, goal, cube = self._draw(options)
             self._place(posture, cube)
-            if self._playable(goal, cube):
+            if self._playable(goal, cube, explicit="object" in options):
                 break
         else:
             if self.stage == "demo" and set(options) <= {"partition"}:
@@ -425,10 +432,14 @@ class KinovaEnv(gymnasium.Env):
         numbers, none NaN."""
         if self.goal is None:
             raise RuntimeError(f"step() {'after close()' if self._client is None else 'before reset()'}")
-        action = action.tolist() if isinstance(action, np.ndarray) else list(action)  # a copy: it is kept
-        if len(action) != 4 or any(a != a for a in action):
+        try:
+            action = action.tolist() if isinstance(action, np.ndarray) else list(action)  # a copy: it is kept
+            velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
+            known = all(a == a for a in action)
+        except (TypeError, ValueError):
+            known = False
+        if not known:
             raise ValueError(f"action {action!r}: must be 4 numbers, none NaN")
-        velocities = [scale * max(-1.0, min(1.0, a)) for scale, a in zip(self._velocity_scale, action, strict=True)]
         self._actions.append(action)
         client = self._client
         pybullet.setJointMotorControlArray(self._robot, ACTIVE_JOINTS, pybullet.VELOCITY_CONTROL, forces=TAU_MAX,

@@ -10,9 +10,10 @@
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's
 normalised units. Gains: `authors` is about as slow as the authors' controller
-(280 steps a demonstration of P2P), `fast` takes some half of these.
+(280 steps a demonstration of P2P), `fast` takes some 110.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -33,7 +34,8 @@ import logx
 from kinova_env import EPSILON, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
-CLEARANCE = {"obstacle": 0.13, "object": 0.15}  # m, of the arm's axis from P2P-O's cube; before P&P's cube, at most
+# m: how far the arm's links keep from P2P-O's cube; how far before P&P's cube the approach begins, at most
+CLEARANCE = {"obstacle": 0.13, "object": 0.15}
 ABOVE = 0.18  # m, of P2P-O's cube at which the TCP crosses it
 ASIDE = 0.19  # m, from P2P-O's cube to which the arm turns away before it rises
 BLEND = 0.1  # m, over which one part of the way over P2P-O's cube becomes the next
@@ -116,8 +118,9 @@ class PID:
         return cross + below * way
 
     def _approach(self):
-        """Postures that grasp on the cube's horizontal axis, as far before its point EPSILON behind the cube as the TCP
-        is beside the axis: aiming past the cube, the arm does not slow down where the grasp comes within reach.
+        """Postures that grasp on the horizontal line from the base's axis through the cube: at the point EPSILON behind
+        the cube, drawn back by the TCP's distance from that line. Aiming past the cube, the arm does not slow down
+        where the grasp comes within reach.
 
         A function of the state, not of what was reached before: a clone of the demonstrations can follow it.
         """
@@ -131,9 +134,7 @@ class PID:
                 return found
 
     def _nearest(self, found):
-        """Of postures (M, 4) the one nearest to the present. Raises ValueError where there is none."""
-        if not len(found):
-            raise ValueError(f"goal {self.env.goal}: out of the arm's reach")
+        """Of postures (M, 4), M > 0, the one nearest to the present."""
         q = np.array(self.env.q)
         return found[np.argmin(wrap(found[:, 0] - q[0]) ** 2 + np.sum((found[:, 1:] - q[1:]) ** 2, axis=1))]
 
@@ -210,6 +211,11 @@ def load_demos(path, task=None):
     kind = "a Minari dataset of our tasks" if str(path).startswith(MINARI) else "a demonstration file of --record"
     try:
         demos, meta = (read_minari if str(path).startswith(MINARI) else read_file)(path)
+        if meta["task"] not in TASKS:
+            raise ValueError(f"its task is {logx.one_line(meta['task'])}")
+        if not len(demos["length"]):
+            raise ValueError("it has no episode")
+        demos = {name: column for name, column in demos.items() if name in ROWS | EPISODES}
         rows, episodes, width = demos["length"].sum(), len(demos["length"]), OBS_DIM[meta["task"]]
         columns = {"obs": (width,), "obs2": (width,), "act": (4,), "executed": (4,)}
         for name in (ROWS | EPISODES).keys() - ({"executed", "effort"} - demos.keys()):
@@ -254,8 +260,6 @@ def read_minari(path):
     tasks = {row.env_id: task for task, row in TASKS.items()}
     meta = {"task": tasks[dataset.env_spec.id], "env_steps": int(dataset.total_steps), "partitions": 4}
     meta |= {"symmetry": "none"} | json.loads(dataset.storage.metadata.get("demonstrations", "{}"))
-    if not dataset.total_episodes:
-        raise ValueError("it has no episode")
     demos = {name: [] for name in ROWS | EPISODES}
     for n, found in enumerate(dataset.iterate_episodes()):
         infos, length = found.infos or {}, len(found.rewards)
@@ -341,14 +345,19 @@ def demonstrations(flags):
 
 
 def inspect(path):
-    """Prints what a demonstration file holds, by partition."""
-    demos, meta = load_demos(path)
-    settings = ", ".join(f"{key} {value}" for key, value in meta.items() if key not in ("task", "env_steps"))
+    """Prints what a demonstration file holds, by partition. Raises BadInput."""
+    try:
+        demos, meta = load_demos(path)
+    except ValueError as error:
+        raise logx.BadInput(f"--inspect {error}") from None
+    names = {key: "K_P K_D K_I" if key == "gains" else key for key in meta if key not in ("task", "env_steps")}
+    settings = ", ".join(f"{name} {meta[key]}" for key, name in names.items())
     print(f"{path}: {meta['task']}, recorded in {meta['env_steps']:,} steps of the environment; {settings}")
     print("partition  episodes  success %  steps, median [least, most]   return     |a|")
     for k in [*np.unique(demos["partition"]), "all"]:
         of = demos["partition"] == k if k != "all" else np.full(len(demos["partition"]), True)
-        length, a = demos["length"][of], demos["act"][np.isin(demos["episode"], np.flatnonzero(of))]
+        length, done = demos["length"][of], demos.get("executed", demos["act"])
+        a = done[np.isin(demos["episode"], np.flatnonzero(of))]
         steps = f"{np.median(length):.0f} [{length.min()}, {length.max()}]"
         print(f"{k!s:>9}  {of.sum():>8}  {100 * demos['success'][of].mean():>9.1f}  {steps:>27}  "
               f"{demos['return'][of].mean():>7.2f}  {np.abs(a).mean():>6.3f}")  # fmt: skip
@@ -358,8 +367,10 @@ def inspect(path):
 class Flags:
     task: str = flag("p2p", choices=tuple(TASKS))
     # one of
-    record: int | None = flag(None, "record N episodes into --out", low=1, metavar="N")
-    trials: int | None = flag(None, "run N episodes and print mean success, length, ...", low=1, metavar="N")
+    record: int | None = flag(None, "record N episodes into --out", low=1, high=1_000_000, metavar="N")
+    trials: int | None = flag(
+        None, "run N episodes and print mean success, length, ...", low=1, high=1_000_000, metavar="N"
+    )
     watch: bool = flag(False, "three episodes in PyBullet's window")
     gif: Path | None = flag(None, "three episodes into a GIF, or an MP4 (pip install -e '.[video]')", metavar="FILE")
     inspect: str | None = flag(None, "print what a demonstration file, or minari:NAME, holds", metavar="FILE")
@@ -373,10 +384,10 @@ class Flags:
     K_I: float | None = flag(None, "instead of that of --gains", low=0)
     clearance: float | None = flag(None, "of the cube, in m; p2po {obstacle}, pnp {object}".format(**CLEARANCE), low=0,
                                    high=0.5, metavar="M")  # fmt: skip
-    noise: float = flag(0.0, "standard deviation of noise on recorded actions", low=0, high=10)
+    noise: float = flag(0.0, "standard deviation of noise on the actions of --record, --trials", low=0, high=10)
     stage: str = flag("demo", choices=STAGES)
     symmetry: str = flag("none", "gas: record one partition, map it to the others", choices=("none", "gas"))
-    partitions: int = flag(4, "K", low=1, metavar="K")
+    partitions: int = flag(4, "K", low=1, high=100, metavar="K")
     seed: int = flag(0, low=0)
 
 
@@ -385,14 +396,22 @@ def check(flags):
     asked = ("record", "trials", "watch", "gif", "inspect")
     jobs = [f"--{name}" for name in asked if getattr(flags, name)]
     if len(jobs) != 1:
-        raise logx.BadInput(f"{' '.join(jobs)}: give one of --{' --'.join(asked)}")
+        raise logx.BadInput(f"--{', --'.join(asked)}: one of them is expected" + f", not {' '.join(jobs)}" * bool(jobs))
+    given = {name for name, value in vars(flags).items() if value != getattr(Flags(), name)}
+    for useless, where in (
+        (given - {"inspect"} if flags.inspect else set(), jobs[0]),
+        ({"noise", "symmetry"} if flags.watch or flags.gif else set(), jobs[0]),
+        ({"symmetry"} if flags.trials else set(), jobs[0]),
+        (set() if TASKS[flags.task].cube else {"clearance"}, f"--task {flags.task}"),
+        (set() if flags.stage == "demo" else {"symmetry", "partitions"}, f"--stage {flags.stage}"),
+    ):
+        for name in sorted(given & useless):
+            raise logx.BadInput(f"--{name}: does not go with {where}")
     film.check(flags.gif, flags.watch)
     if bool(flags.record) != bool(flags.out or flags.minari):
         raise logx.BadInput("--record, --out or --minari: --record needs one of the others, and they need it")
     if flags.minari:
         check_minari(flags.minari)
-    if flags.symmetry == "gas" and flags.stage != "demo":
-        raise logx.BadInput(f"--symmetry gas: needs --stage demo, not {flags.stage}")
     if flags.out and (flags.out.is_dir() or not flags.out.absolute().parent.is_dir()):
         raise logx.BadInput(f"--out {flags.out}: must be a file in a folder")
 
@@ -415,13 +434,23 @@ def check_minari(name):
         raise logx.BadInput(f"--minari {name}: there is one already; minari delete {name} removes it")
 
 
+@contextlib.contextmanager
+def writing(name, place):
+    """Around what writes to the flag's `place`: raises BadInput where it cannot."""
+    try:
+        yield
+    except OSError as error:
+        raise logx.BadInput(f"--{name} {place}: cannot be written ({error.strerror or error})") from None
+
+
 def show(flags, gains):
     """Three episodes in PyBullet's window, or as a GIF."""
     settings = dict(stage=flags.stage, partitions=flags.partitions, width=480, height=360)
     env = gymnasium.make(TASKS[flags.task].env_id, render_mode="rgb_array" if flags.gif else "human", **settings)
     pid, seeds = PID(env, gains, flags.clearance), range(flags.seed, flags.seed + 3)
     if flags.gif:
-        film.film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
+        with writing("gif", flags.gif):
+            film.film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
         print(f"wrote {flags.gif}")
     for seed in () if flags.gif else seeds:
         env.reset(seed=seed)
@@ -437,24 +466,22 @@ def main():
     gains = [named if given is None else given for given, named in zip(own, GAINS[flags.gains], strict=True)]
     settings = dict(gains=gains, seed=flags.seed, partitions=flags.partitions, symmetry=flags.symmetry)
     settings |= dict(noise=flags.noise, clearance=flags.clearance)
+    if flags.inspect:
+        return inspect(flags.inspect)
     try:
-        if flags.inspect:
-            return inspect(flags.inspect)
         if flags.watch or flags.gif:
             return show(flags, gains)
         demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
-        if flags.record:
-            meta = dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings)
-            if flags.minari:
-                write_minari(flags.minari, demos, meta)
-            if flags.out:
-                packed = dict(demos, meta=np.array(json.dumps(meta)))
-                logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **packed))
-    except OSError as error:
-        name = next(name for name in ("gif", "out", "minari") if getattr(flags, name))
-        raise logx.BadInput(f"--{name} {getattr(flags, name)}: cannot be written ({error.strerror or error})") from None
-    except ValueError as error:  # sectors too narrow, no display
-        raise logx.BadInput(f"--{'watch: ' * flags.watch}{'inspect ' * bool(flags.inspect)}{error}") from None
+    except ValueError as error:  # sectors too narrow
+        raise logx.BadInput(f"--{error}") from None
+    meta = dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings)
+    if flags.minari:
+        with writing("minari", flags.minari):
+            write_minari(flags.minari, demos, meta)
+    if flags.out:
+        packed = dict(demos, meta=np.array(json.dumps(meta)))
+        with writing("out", flags.out):
+            logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **packed))
     won = demos["success"]
     length = f"{demos['length'][won].mean():.0f} steps" if won.any() else "no success"
     print(

@@ -42,7 +42,7 @@ class Flags(logx.RunFlags):
     )
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
-    partitions: int = flag(4, "K", low=1)
+    partitions: int = flag(4, "K", low=1, high=100)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
     demos: str | None = flag(
         None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"

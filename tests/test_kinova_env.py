@@ -85,7 +85,10 @@ def test_window_without_a_display_is_a_value_error_that_says_so(monkeypatch):
     ("p2p", "train", {"start": (0, 0.35, 0.25)}, "start .*0.35"),  # in reach, but not with a horizontal tool
     ("p2p", "train", {"goal": (0, 1.5, 0.42)}, "goal .*1.5"),
     ("p2po", "train", {"object": (0, 0.5, 1.5)}, "object .*1.5"),
-    ("pnp", "train", {"object": (0, 0.35, 0.25)}, "object .*0.35"),  # in reach, but not to be grasped
+    ("pnp", "train", {"object": (0, 0.35, 0.25)}, "object .*0.35"),  # in reach, but with no level hand
+    ("pnp", "train", {"goal": (0, 0.1, 1.25)}, "goal .*1.25.*cubes"),  # in reach, and no cube beside it is
+    ("pnp", "train", {"object": (0, -0.5, 0.4)}, "object .*rho >= 0"),
+    ("p2p", "train", {"start": "abc"}, "start 'abc'"),
     ("p2p", "train", {"goal": (0, 0.5)}, "goal .*three"),
     ("p2p", "train", {"goal": (0, math.nan, 0.4)}, "goal .*nan"),
     ("p2p", "train", {"object": (0, 0.5, 0.42)}, "object"),
@@ -114,12 +117,12 @@ def test_explicit_options_that_no_draw_would_give_begin_an_episode(make, task, s
         np.testing.assert_allclose(named[name], cartesian(*options[name]), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("action", [[0, 0, math.nan, 0], [0, 0, 0], [[0, 0, 0, 0]]])
+@pytest.mark.parametrize("action", [[0, 0, math.nan, 0], [0, 0, 0], [[0, 0, 0, 0]], [[0], [0], [0], [0]], 0, ["0"] * 4])
 def test_what_is_no_action_is_a_value_error(make, action):
     env = make("p2p")
     env.reset(seed=0)
     with pytest.raises(ValueError, match="must be 4 numbers"):
-        env.step(np.array(action, dtype=np.float32))
+        env.step(np.array(action))
 
 
 # ---- the class docstring against the code ----------------------------------------------------------------------------

@@ -405,6 +405,8 @@ BROKEN = {  # how a good file is spoilt
     "no end": lambda path, good: save(path, good | {end: good[end] & False for end in ("terminated", "truncated")}),
     "meta not JSON": lambda path, good: save(path, good | {"meta": np.array("{")}),
     "meta without a task": lambda path, good: save(path, good | {"meta": np.array("{}")}),
+    "of an unknown task": lambda path, good: save(path, good | {"meta": np.array('{"task": "fly"}')}),
+    "no episode": lambda path, good: save(path, {key: good[key][:0] if good[key].ndim else good[key] for key in good}),
     "meta a list": lambda path, good: save(path, good | {"meta": np.array('["p2p"]')}),
 }
 
@@ -412,7 +414,7 @@ BROKEN = {  # how a good file is spoilt
 @pytest.mark.parametrize("how", BROKEN)
 def test_file_that_is_not_whole_demonstrations_is_a_value_error_that_names_it(tmp_path, good, how):
     path = tmp_path / "demos.npz"
-    save(path, good)
+    save(path, good | {"note": np.array("what a file holds beside is left out")})
     assert set(load_demos(path, "p2p")[0]) == set(good) - {"meta"}
     BROKEN[how](path, good)
     with pytest.raises(ValueError) as error:
@@ -435,7 +437,14 @@ def test_pickled_file_is_never_unpickled(tmp_path, good):
 # ---- the command line ------------------------------------------------------------------------------------------------
 
 BAD = [  # arguments ({} is an empty folder), what the line names
-    ("", "--record --trials --watch --gif --inspect"),
+    ("", "--record, --trials, --watch, --gif, --inspect"),
+    ("--gif {}/x.gif --noise 0.2", "--noise: does not go with --gif"),
+    ("--trials 1 --symmetry gas", "--symmetry: does not go with --trials"),
+    ("--trials 1 --clearance 0.1", "--clearance: does not go with --task p2p"),
+    ("--trials 1 --stage test --partitions 3", "--partitions: does not go with --stage test"),
+    ("--inspect {}/x.npz --seed 1", "--seed: does not go with --inspect"),
+    ("--trials 1 --partitions 101", "--partitions 101"),
+    ("--trials 99999999999999999999", "--trials 9"),
     ("--trials 1 --gif {}/x.gif", "--trials --gif"),
     ("--record 1", "--out"),
     ("--trials 1 --out {}/x.npz", "--out"),
@@ -444,7 +453,7 @@ BAD = [  # arguments ({} is an empty folder), what the line names
     ("--gif {}/none/x.gif", "none/x.gif"),
     ("--gif {}/x.png", ".gif or .mp4"),
     ("--trials 1 --K_D nan", "--K_D nan"),
-    ("--trials 1 --symmetry gas --stage test", "--stage"),
+    ("--record 1 --out {}/x.npz --symmetry gas --stage test", "--stage"),
     ("--trials 1 --partitions 40 --task pnp", "--partitions 40"),
     ("--watch", "--watch: needs a display"),
     ("--inspect {}/none.npz", "none.npz: no such file"),
