@@ -282,11 +282,13 @@ def load_torch(path):
 
 
 def versions():
-    """What a run was made with: packages, Python, machine, git commit ("-dirty" with uncommitted changes)."""
+    """What a run was made with: packages, Python, machine, CPU, git commit ("-dirty" with uncommitted changes)."""
     made_with = {"python": platform.python_version(), "platform": platform.platform()}
     for package in ("torch", "numpy", "gymnasium", "pybullet", "pybullet-arm64"):  # the last is the other one's fork
         with contextlib.suppress(PackageNotFoundError):
             made_with[package] = version(package)
+    if torch := sys.modules.get("torch"):  # on the instructions that it uses the last bits of a curve depend
+        made_with["cpu"] = torch.backends.cpu.get_cpu_capability()
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:
         commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()

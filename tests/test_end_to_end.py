@@ -245,7 +245,7 @@ def test_a_run_folder_holds_settings_curves_checkpoint_and_policy(unbroken, algo
     config = json.loads((folder / "config.json").read_text())
     assert {field.name for field in fields(script.Flags)} <= set(config) and config["algo"] == algo
     assert Path(config["command"][0]).name == f"{algo}_demoease.py" and "--hidden_sizes" in config["command"]
-    assert {"python", "torch", "numpy", "gymnasium", "git_commit"} <= set(config["versions"])
+    assert {"python", "torch", "numpy", "gymnasium", "git_commit", "cpu"} <= set(config["versions"])
     assert {"pybullet", "pybullet-arm64"} & set(config["versions"])  # the package or its fork
     episodes, progress = rows_of(folder / "episodes.csv"), rows_of(folder / "progress.csv")
     assert list(episodes[0]) == "episode,env_steps,return,length,success,collision".split(",")
