@@ -108,9 +108,15 @@ def resolve(flags):
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
-    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters), "ddpg")
+    defaults = recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters)
+    flags = logx.fill_in(flags, defaults, "ddpg")
+    for name in ("clone_iters", "keep_clone", "demo_noise", "normalize_obs"):
+        if flags.num_demos == 0 and getattr(flags, name) not in (0, defaults[name]):
+            raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
+    if flags.noise_kept == 1:
+        raise logx.BadInput("--noise_kept 1: leaves no new noise; less than 1 is allowed")
     if flags.keep_clone and not flags.clone_iters:
         raise logx.BadInput(f"--keep_clone {flags.keep_clone:g}: there is no clone at --clone_iters 0; 0 is allowed")
     return flags

@@ -387,9 +387,12 @@ def after_training(folder, task, gains, quiet):
     gains = gains or "fast"
     agents = {str(folder): folder, f"PID, {gains} gains": gains}
     found = {name: run_trials(task, source, 100, quiet=quiet) for name, source in agents.items()}
-    write(folder, *found[str(folder)])
-    print_table({name: rows for name, (rows, _) in found.items()})
-    show({str(folder): (task, folder)}, range(6), folder / "agent.gif", quiet)
+    try:
+        write(folder, *found[str(folder)])
+        print_table({name: rows for name, (rows, _) in found.items()})
+        show({str(folder): (task, folder)}, range(6), folder / "agent.gif", quiet)
+    except OSError as error:
+        raise logx.BadInput(f"{folder}: cannot be written ({error.strerror})") from None
 
 
 def print_agents():

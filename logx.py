@@ -204,8 +204,10 @@ def recorded(cls, asked):
             raise ValueError(f"its config.json, of {config.get('algo')}, lacks {len(missing)} of this script's flags")
     except (OSError, ValueError, AttributeError) as error:
         raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
-    where = {"name": folder.name, "data_dir": str(folder.parent), "resume": True}
-    return cls(**(before | {"quiet": False} | asked | where))
+    for name in {"name", "data_dir"} & set(asked):
+        raise BadInput(f"--{name} {asked[name]}: does not go with --resume {folder}, which says it")
+    where = {"name": folder.name, "data_dir": str(folder.parent)}
+    return cls(**(before | {"quiet": False} | asked | where | {"resume": True}))
 
 
 def fill_in(flags, defaults, algo):
@@ -232,7 +234,7 @@ def fill_in(flags, defaults, algo):
         length = "" if flags.own_length else f"epochs={flags.epochs}"
         words = [flags.task, algo, flags.recipe, f"N{flags.num_demos}", f"lambda{flags.lambda_bc:g}", flags.symmetry]
         flags.name = "-".join([*words, *filter(None, (flags.variant, length)), f"seed{flags.seed}"])
-    if "/" in flags.name or flags.name in ("", ".", "..") or len(flags.name.encode()) > 200:
+    if "/" in flags.name or flags.name in ("", ".", "..") or len(os.fsencode(flags.name)) > 200:
         raise BadInput(f"--name {flags.name!r}: must be the name of one folder, 200 letters at most")
     if not str(flags.data_dir):
         raise BadInput("--data_dir '': must be a folder; . is the present one")
@@ -354,8 +356,7 @@ class RunFolder:
         self.total_steps = flags.epochs * flags.steps_per_epoch
         self.columns = {"episodes": EPISODES, "progress": [*PROGRESS, *measured, *EVALUATED]}
         self._config = json.loads(json.dumps(dataclasses.asdict(flags) | {"algo": algo}, default=str))
-        self._files, self._board, self._bar = {}, None, None
-        self.stop_signals = []
+        self._files, self._board, self._bar, self.stop_signals = {}, None, None, []
         self._log = {"episodes": 0, "epoch_episodes": [], "epoch_updates": [], "demo_env_steps": 0}
         if flags.tensorboard:
             try:
@@ -374,6 +375,9 @@ class RunFolder:
                 raise BadInput(f"{name}: {folder} exists; go on with --resume, or choose another --name")
             if list(folder.glob("*.csv.gz")):
                 raise BadInput(f"{name}: {folder} is a published run, without the state to go on from; begin a new one")
+            lost = (folder / "policy.pt").exists() and not (folder / "checkpoint.pt").exists()
+            if lost and (folder / "progress.csv").read_text().count("\n") > self.flags.checkpoint_every + 1:
+                raise BadInput(f"{name}: {folder} has lost its checkpoint.pt; begin a new one")
             self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = open(folder / "lock", "w")  # noqa: SIM115 - held until close
@@ -417,10 +421,8 @@ class RunFolder:
             raise BadInput(f"{path}: a run's settings as JSON are expected ({one_line(error)})") from None
 
     def __enter__(self):
-        if threading.current_thread() is threading.main_thread():  # elsewhere Python has no signals
-            self._handlers = {number: signal.signal(number, self._asked_to_stop) for number in STOP_SIGNALS}
-        else:
-            self._handlers = {}
+        main = threading.current_thread() is threading.main_thread()  # elsewhere Python has no signals
+        self._handlers = {n: signal.signal(n, self._asked_to_stop) for n in STOP_SIGNALS if main}
         return self
 
     def _asked_to_stop(self, number, frame):
@@ -452,10 +454,8 @@ class RunFolder:
 
     def begin(self, demo_env_steps=0):
         """Writes config.json, opens the curves, cut back to the checkpoint, and says what comes."""
-        start = 0
-        if self.checkpoint:
-            start = self.checkpoint["t"]
-        else:
+        start = self.checkpoint["t"] if self.checkpoint else 0
+        if not self.checkpoint:
             self._log["demo_env_steps"] = demo_env_steps
             if self.flags.resume and not self.flags.quiet:
                 print(f"{self.folder}: no checkpoint there, so this begins a new run")
@@ -576,11 +576,10 @@ class RunFolder:
     def stop_if_asked(self, env_steps):
         """After a save: raises KeyboardInterrupt where the run was asked to stop before its end."""
         if self.stop_signals and env_steps < self.total_steps:
-            text = f"{self.folder}: stopped at step {env_steps}, state saved; go on with --resume"
-            raise KeyboardInterrupt(text)
+            raise KeyboardInterrupt(f"{self.folder}: stopped at step {env_steps}, state saved; go on with --resume")
 
     def seconds(self):
-        """Wall-clock seconds of the run, earlier parts included."""
+        """Wall-clock seconds of the run, earlier parts included, the recording of demonstrations not."""
         return self._seconds + time.monotonic() - self._since
 
     def save(self, state, policy):

@@ -60,7 +60,9 @@ class Flags(logx.RunFlags):
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
     lam: float = flag(0.97, "of the advantage estimates: lambda in Alg. 2, gamma^GAE in Table 2", low=0, high=1)
     clip_ratio: float = flag(0.2, "epsilon", low=0)
-    target_kl: float = flag(0.02, "D_KL from the policy that acted, on own samples, that ends the updates", low=0)
+    target_kl: float = flag(
+        0.02, "D_KL from the policy that acted, on own samples, that ends the updates; 0: before the first", low=0
+    )
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
@@ -97,7 +99,11 @@ def resolve(flags):
     flags = logx.check_flags(replace(flags, recipe=flags.recipe or ("robust" if flags.quick else "paper")))
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
-    flags = logx.fill_in(flags, recipe_defaults(flags.task, flags.recipe, flags.num_demos), "ppo")
+    defaults = recipe_defaults(flags.task, flags.recipe, flags.num_demos)
+    flags = logx.fill_in(flags, defaults, "ppo")
+    for name in ("clone_iters", "demo_noise"):
+        if flags.num_demos == 0 and getattr(flags, name) not in (0, defaults[name]):
+            raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
     if flags.demos_in_B_o and flags.demo_noise:

@@ -48,7 +48,8 @@ TASKS = ("p2p", "p2po", "pnp")
 SCRIPTS = {"ddpg": "ddpg_demoease", "ppo": "ppo_demoease"}
 NOT_VARIED = ("task", "seed", "name", "data_dir", "resume", "quick", "quiet")  # the sweep's own
 STOPPED = 130  # exit code of a run that was asked to stop, and saved its state
-EXIT = "sweep: exit code "  # how a line of log.txt begins
+SAYS = "sweep: "  # how lines of log.txt begin that are the sweep's own
+EXIT = SAYS + "exit code "
 HELD = "another process is running"  # how a run is refused whose folder is held: begun by a sweep that was killed
 
 
@@ -101,6 +102,8 @@ class Job:
         """Its process; what it prints goes to log.txt."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with open(self.folder / "log.txt", "a") as log:
+            log.write(f"{SAYS}begins\n")
+            log.flush()
             return subprocess.Popen(self.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
     def note_end(self, code):
@@ -138,7 +141,7 @@ class Job:
             return "queued", ""
         steps, lines = self.steps(), self.text("log.txt").splitlines() or [""]
         code = lines[-1].removeprefix(EXIT) if lines[-1].startswith(EXIT) else ""
-        said = [line for line in lines if line.strip() and not line.startswith(EXIT)] or ["it said nothing"]
+        said = [line for line in lines if line.strip() and not line.startswith(SAYS)] or ["it said nothing"]
         logged, saved = (self.folder / name for name in ("progress.csv", "checkpoint.pt"))
         if steps >= self.total and (  # by log.txt, or where it was run by hand
             code == "0" or (saved.exists() and saved.stat().st_mtime_ns >= logged.stat().st_mtime_ns)
@@ -194,6 +197,7 @@ def grid(flags):
     jobs = {}
     for task in flags.task:
         chosen = [setting for name, setting in columns(task).items() if name in (flags.columns or [name])]
+        made = {}  # {folder: the column and the values that make it}
         for (algo, N, lam), varied in itertools.product(chosen, combinations(flags.vary)):
             script = importlib.import_module(SCRIPTS[algo])  # here, since torch takes seconds
             setting = {"task": task, "recipe": flags.recipe, "num_demos": f"{N}", "lambda_bc": f"{lam:g}"}
@@ -203,15 +207,20 @@ def grid(flags):
                 asked = logx.parse_flags(script.Flags, "", words)
                 # P2P's "N_demos = 0, lambda = 1" is plain DDPG like the baseline: its seeds are others
                 first = flags.first_seed + 100 * ((task, asked.num_demos, asked.lambda_bc) == ("p2p", 0, 1))
-                for seed in range(first, first + flags.seeds):
-                    f = script.resolve(replace(asked, seed=seed))
-                    command = (f"{SCRIPTS[algo]}.py", *words, "--seed", f"{seed}")
-                    kind = (algo, task, f.recipe, f.variant, bool(f.num_demos))
-                    folder = flags.data_dir / f.name
-                    total, clone_iters = f.epochs * f.steps_per_epoch, f.clone_iters * bool(f.num_demos)
-                    jobs[folder] = Job(folder, total, command, kind, clone_iters)
+                found = [script.resolve(replace(asked, seed=seed)) for seed in range(first, first + flags.seeds)]
             except logx.BadInput as error:
                 raise logx.BadInput(f"{SCRIPTS[algo]}.py: {error}") from None
+            for f in found:
+                folder = flags.data_dir / f.name
+                before = made.setdefault((algo, N, lam, folder), varied)
+                for name in (name for name in varied if varied[name] != before[name]):
+                    raise logx.BadInput(
+                        f"--vary {name}: {before[name]} and {varied[name]} make the one folder {folder}"
+                    )
+                command = (f"{SCRIPTS[algo]}.py", *words, "--seed", f"{f.seed}")
+                kind = (algo, task, f.recipe, f.variant, min(4, f.num_demos))
+                total, clone_iters = f.epochs * f.steps_per_epoch, f.clone_iters * bool(f.num_demos)
+                jobs[folder] = Job(folder, total, command, kind, clone_iters)
     return list(jobs.values())
 
 
@@ -221,7 +230,7 @@ def costs(jobs):
     for kind, job in tqdm({job.kind: job for job in jobs}.items(), "measuring", leave=False, disable=None):
         algo, *_, demos = kind
         clone_iters = min(job.clone_iters, 200)
-        short = ["--epochs", "2", "--eval_every", "0", "--num_demos", "4" if demos else "0"]
+        short = ["--epochs", "2", "--eval_every", "0", "--num_demos", f"{demos}"]
         short += ["--clone_iters", f"{clone_iters}"] * bool(clone_iters)
         short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []
         with tempfile.TemporaryDirectory() as folder:
@@ -258,13 +267,17 @@ def run_here(jobs, at_a_time):
     while active or (waiting and not asked):
         if waiting and len(active) < at_a_time and not asked:
             job = waiting.pop(0)
-            active[job] = job.start()
+            try:
+                active[job] = job.start()
+            except OSError as error:
+                bar.write(f"failed   {job.folder} cannot be written ({error.strerror})")
         if asked and not told:
             told = [process.terminate() for process in active.values()]
         for job, process in list(active.items()):
             if process.poll() is not None:
                 del active[job]
-                job.note_end(STOPPED if asked and process.returncode < 0 else process.returncode)
+                with contextlib.suppress(OSError):  # no space, as the run itself has said
+                    job.note_end(STOPPED if asked and process.returncode < 0 else process.returncode)
                 state, error = job.state()
                 bar.write(f"{state:8} {job.folder} {error}".rstrip())
             steps[job] = job.steps()
@@ -316,6 +329,8 @@ def submit(jobs, flags):
         raise logx.BadInput("--cluster slurm: needs submitit (pip install -r requirements-slurm.txt)") from None
     except (RuntimeError, submitit.core.utils.FailedJobError) as error:  # no Slurm here; or it refused
         raise logx.BadInput(f"--cluster slurm: {error}") from None
+    except OSError as error:
+        raise logx.BadInput(f"--data_dir {flags.data_dir}: {error.strerror}; a folder is expected") from None
     for job, its in zip(jobs, submitted, strict=True):
         job.folder.mkdir(parents=True, exist_ok=True)
         (job.folder / "slurm_job").write_text(its.job_id)
@@ -336,6 +351,11 @@ def parse(argv=None):
     for name in flags.columns or ():
         if name not in known:
             raise logx.BadInput(f"--columns {name}: {' '.join(flags.task)} has {' '.join(known)}")
+    if flags.epochs and any(text.startswith("epochs=") for text in flags.vary or ()):
+        raise logx.BadInput(f"--epochs {flags.epochs}: does not go with --vary epochs")
+    for name in ("nice",) if flags.cluster else ("partition", "time", "mem_gb", "signal_delay"):
+        if getattr(flags, name) != getattr(Flags, name):
+            raise logx.BadInput(f"--{name}: goes with{'out' * bool(flags.cluster)} --cluster")
     if flags.cluster:
         flags.data_dir = flags.data_dir.absolute()
     return flags
@@ -372,7 +392,7 @@ def main(argv=None):
     cost = costs(todo) if flags.dry_run else {}
     for job in jobs:
         print(f"{states[job]:8} {hours(cost[job]) if job in cost else '':>8}  {shlex.join(['python', *job.words])}")
-    total = f": {sum(cost.values()) / 3600:.1f} core-hours by short runs here, evaluations not counted"
+    total = f": {sum(cost.values()) / 3600:.1f} core-hours by short runs here, recording and evaluations not counted"
     print(f"{len(jobs)} runs, {len(todo)} to do" + total * flags.dry_run)
     if flags.dry_run or not todo:
         return 0

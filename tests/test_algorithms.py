@@ -485,7 +485,7 @@ def another(field, value):
 
 
 def test_runs_that_differ_in_any_setting_differ_in_their_variant_and_name(script, tmp_path):
-    # off-policy cloning first needs demos_in_B_o, on-policy noise does not go with it; keep_clone needs a clone
+    # on-policy noise does not go with demos_in_B_o; keep_clone needs a clone
     base = dict(task="pnp", demos_in_B_o=script is ddpg, clone_iters=1, num_demos=4)
     plain = script.resolve(script.Flags(**base))
     changed = {field.name: another(field, getattr(plain, field.name)) for field in fields(script.Flags)

@@ -402,7 +402,7 @@ def test_updates_per_step_is_kept_up_with(world, blocks):
 
 # ---- defaults --------------------------------------------------------------------------------------------------------
 
-DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 5; 5 T, 2 T and T are ours
+DEFAULTS = {  # Table 1, Sec. 4.2; N and lambda are the largest of Tables 4 and 5; 5 T, 2 T and T are the release's
     "p2p": dict(max_ep_len=400, epochs=250, update_every=20, num_demos=100, lambda_bc=1.8, hidden_sizes=(128, 512, 128),
                 steps_per_epoch=2000, start_steps=800, update_after=400),
     "p2po": dict(max_ep_len=500, epochs=500, update_every=25, num_demos=250, lambda_bc=2,
@@ -413,12 +413,26 @@ AS_PUBLISHED = dict(recipe="paper", replay_size=10**6, batch_size=100, demo_batc
                     polyak=0.995, pi_lr=1e-3, q_lr=1e-3, symmetry="gas", partitions=4, mask="q", n_step=1,
                     clone_iters=0, keep_clone=0.0,
                     noise_kept=0, updates_per_step=1, normalize_obs=False, grasp_input=False)  # fmt: skip
+ROBUST = dict(symmetry="mirror", gains="fast", demo_noise=0.2, noise_kept=0.9, n_step=10, clone_iters=10_000,
+              keep_clone=10, updates_per_step=0.25, pi_lr=3e-4, q_lr=1e-3, start_steps=0, mask="q")  # fmt: skip
+ROBUST_TASK = {
+    "p2p": dict(epochs=25, steps_per_epoch=1000, act_noise=0.2, normalize_obs=False, grasp_input=False),
+    "p2po": dict(epochs=40, steps_per_epoch=2500, act_noise=0.1, normalize_obs=False, grasp_input=False),
+    "pnp": dict(epochs=25, steps_per_epoch=4000, act_noise=0.2, normalize_obs=True, grasp_input=True),
+}
 
 
 @pytest.mark.parametrize("task", DEFAULTS)
 def test_the_defaults_are_those_of_table_1(task):
     flags = vars(resolve(task=task))
     expected = DEFAULTS[task] | AS_PUBLISHED
+    assert {name: flags[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize("task", ROBUST_TASK)
+def test_the_recipe_robust_is_that_of_the_readme(task):
+    flags = vars(resolve(task=task, recipe="robust"))
+    expected = ROBUST | ROBUST_TASK[task]
     assert {name: flags[name] for name in expected} == expected
 
 
@@ -430,10 +444,12 @@ def test_a_very_short_episode_still_updates():
 
 
 @pytest.mark.parametrize("flags, says", [
-    (dict(keep_clone=1.0), "--keep_clone 1: there is no clone at --clone_iters 0"),
+    (dict(keep_clone=1.0, num_demos=4), "--keep_clone 1: there is no clone at --clone_iters 0"),
+    (dict(normalize_obs=True), "--normalize_obs: is of demonstrations, and --num_demos 0 has none"),
+    (dict(noise_kept=1.0), "--noise_kept 1: leaves no new noise"),
     (dict(grasp_input=True), "--grasp_input: --task p2p has nothing to grasp; allowed on --task pnp"),
     (dict(num_demos=4, replay_size=10), "--replay_size 10: must hold the 18 demonstrated steps"),
-], ids=["no clone", "nothing to grasp", "B_o too small"])  # fmt: skip
+], ids=["no clone", "no demonstrations", "no noise", "nothing to grasp", "B_o too small"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ddpg, tmp_path, "a", recorded=demo_arrays(), **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()

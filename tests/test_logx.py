@@ -434,6 +434,16 @@ def test_a_resume_without_a_checkpoint_begins_a_new_run_and_says_so(tmp_path, ca
     assert capsys.readouterr().out.startswith(f"{run.folder}: no checkpoint there, so this begins a new run\n")
 
 
+def test_a_run_that_has_lost_its_checkpoint_keeps_its_curves(stopped):
+    (stopped / "checkpoint.pt").unlink()
+    with open(stopped / "progress.csv", "a") as file:
+        file.write("\n" * Flags().checkpoint_every)  # more epochs than can be without a checkpoint
+    before = {path.name: path.read_bytes() for path in stopped.iterdir()}
+    with pytest.raises(BadInput, match=f"{stopped} has lost its checkpoint.pt"):
+        folder_of(stopped, resume=True)
+    assert {path.name: path.read_bytes() for path in stopped.iterdir()} == before
+
+
 def test_a_published_run_is_not_begun_again_in_its_place(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "episodes.csv.gz").touch()
@@ -613,6 +623,9 @@ def test_resume_of_a_folder_takes_the_flags_of_the_run_there_and_what_is_asked_n
         flags = logx.parse_flags(Flags, "", ["--resume", str(folder), "--epochs", "9", "--gamma", "0.99"])
         assert (flags.epochs, flags.gamma, flags.hidden_sizes, flags.resume) == (9, 0.99, (16, 16), True)
         assert (Path(flags.data_dir) / flags.name).resolve() == stopped.resolve()
+    for name in ("name", "data_dir"):
+        with pytest.raises(BadInput, match=f"--{name} b: does not go with --resume"):
+            logx.parse_flags(Flags, "", ["--resume", str(stopped), f"--{name}", "b"])
     assert logx.parse_flags(Flags, "", ["--resume"]) == Flags(resume=True)
 
 

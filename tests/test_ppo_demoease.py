@@ -388,6 +388,18 @@ def test_the_input_for_the_cube_is_one_exactly_while_the_environment_says_that_i
 # ---- symmetry --------------------------------------------------------------------------------------------------------
 
 
+def test_mirror_reflects_every_other_demonstrated_step_of_a_batch():
+    learner, _ = a_learner(symmetry="mirror")
+    B_d = buffer_of(trajectories(ENDS, seed=8, own=0), "mirror")
+    i, s, a, r = learner.demo_batch(B_d)
+    stored_s, stored_a, stored_r, *_ = B_d.columns(i)
+    other_s, other_a = gas.mirror(stored_s, stored_a)
+    for found, stored, other in ((s, stored_s, other_s), (a, stored_a, other_a)):
+        assert torch.equal(found[::2], other[::2]) and torch.equal(found[1::2], stored[1::2])
+        assert not torch.equal(stored, other)
+    assert torch.equal(r, stored_r)
+
+
 def test_so2_turns_each_trajectory_by_one_angle_and_each_demonstrated_step_by_its_own(monkeypatch):
     seen, columns = [], ppo.TrajectoryBuffer.columns
     monkeypatch.setattr(ppo.TrajectoryBuffer, "columns", lambda self, i=None, angle=None: seen.append(
@@ -528,6 +540,17 @@ AS_PUBLISHED = dict(
 )  # fmt: skip - the last three: spinningup
 
 
+ROBUST = dict(symmetry="mirror", gains="fast", demo_noise=0.2, clone_iters=10_000, demos_in_B_o=False, log_std=-2,
+              pi_lr=3e-6, vf_lr=1e-3, epochs=50, steps_per_epoch=4000, train_iters=20, mask="reward")  # fmt: skip
+
+
+@pytest.mark.parametrize("task", DEFAULTS)
+def test_the_recipe_robust_is_that_of_the_readme(task):
+    flags = vars(resolve(task=task, recipe="robust"))
+    expected = ROBUST | dict(demos_per_epoch=DEFAULTS[task]["num_demos"], grasp_input=task == "pnp")
+    assert {name: flags[name] for name in expected} == expected
+
+
 @pytest.mark.parametrize("task", DEFAULTS)
 def test_the_defaults_are_those_of_table_2(task):
     flags = vars(resolve(task=task))
@@ -546,9 +569,10 @@ def test_demonstrations_an_epoch_are_a_fifth_of_those_asked_for_rounded_up_and_a
 
 @pytest.mark.parametrize("flags, says", [
     (dict(grasp_input=True), "--grasp_input: --task p2p has nothing to grasp; allowed on --task pnp"),
-    (dict(demo_noise=0.1, demos_in_B_o=True), "--demos_in_B_o"),
+    (dict(demo_noise=0.1, demos_in_B_o=True, num_demos=4), "--demos_in_B_o"),
+    (dict(clone_iters=5), "--clone_iters: is of demonstrations, and --num_demos 0 has none"),
     (dict(num_demos=4, recorded=demo_arrays() | dict(executed=None)), "--no-demos_in_B_o"),
-], ids=["the cube's input without a cube", "noisy demonstrations in B_o", "a file of them in B_o"])  # fmt: skip
+], ids=["no cube", "noisy demonstrations in B_o", "none to clone", "a file of them in B_o"])  # fmt: skip
 def test_flags_that_do_not_go_together_are_bad_input(flags, says, tmp_path):
     run = scripted_run(ppo, tmp_path, "a", **flags)
     assert isinstance(run.error, logx.BadInput) and says in str(run.error) and not run.folder.exists()

@@ -148,6 +148,10 @@ def test_varied_values_are_written_as_in_the_names_of_folders():
     (["--columns", "lambda=7"], "--columns lambda=7: p2p p2po pnp has lambda=0.1"),
     (["--task", "pnp", "--columns", "lambda=1.8"], "--columns lambda=1.8: pnp has lambda=5"),
     (["--seeds", "0"], "--seeds 0: must be at least 1"),
+    (["--partition", "cpu"], "--partition: goes with --cluster"),
+    (["--cluster", "slurm", "--nice", "9"], "--nice: goes without --cluster"),
+    (["--epochs", "2", "--vary", "epochs=3"], "--epochs 2: does not go with --vary epochs"),
+    (["--vary", "eval_every=0,5"], "--vary eval_every: 0 and 5 make the one folder data/runs/p2p-ddpg-paper-N100"),
     (["--time", "2"], "--time 2: must be --signal_delay, 90 s, and a minute more"),
     (["--data_dir", __file__], f"--data_dir {__file__}: is a file"),
     (["--vary", "gamma"], "--vary gamma: must be FLAG=VALUE"),
@@ -215,6 +219,14 @@ def swept(tmp_path_factory):
     jobs[0].folder.mkdir()
     (jobs[0].folder / "checkpoint.pt").write_bytes(b"half a file")
     return flags, jobs, sweep.main(flags)
+
+
+def test_a_folder_that_cannot_be_written_does_not_stop_the_other_runs(tmp_path, capsys):
+    flags = [*SHORT, "--data_dir", str(tmp_path), "--seeds", "2"]
+    spoilt, other = jobs_of(*flags)
+    spoilt.folder.write_text("a file")
+    assert sweep.main(flags) == 1 and other.state() == ("done", "")
+    assert f"failed   {spoilt.folder} cannot be written" in "".join(capsys.readouterr())
 
 
 def test_run_that_fails_is_reported_with_its_last_line_and_does_not_stop_the_others(swept, capsys):
