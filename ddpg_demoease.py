@@ -47,11 +47,11 @@ class Flags(logx.RunFlags):
         None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"
     )
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
-    # length (Table 1; 5 T steps an epoch is ours: the paper does not say)
+    # length (Table 1; 5 T steps an epoch: the authors' code)
     epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 25", low=1)
     steps_per_epoch: int | None = flag(None, "environment steps an epoch; 5 T, robust p2p: 1000", low=1)
     max_ep_len: int | None = flag(None, "T of own episodes; p2p 400, p2po 500, pnp 800", low=1)
-    # the algorithm (Table 1; start_steps and update_after: ours)
+    # the algorithm (Table 1; start_steps and update_after: the authors' code)
     update_every: int | None = flag(None, "N_up, steps between blocks of N_up * updates_per_step updates; T/20", low=1)
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T, robust: 0", low=0)
     update_after: int | None = flag(None, "no updates before; T", low=0)

@@ -9,8 +9,8 @@
 
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's
-normalised units. Gains: `authors` is about as slow as the authors' controller
-(280 steps a demonstration of P2P), `fast` takes some 110.
+normalised units. Gains: `authors` are those of the authors' code (280 steps a
+demonstration of P2P); with `fast` it takes some 110.
 """
 
 import contextlib

@@ -3,7 +3,7 @@
     python plot_curves.py --table training --task p2p       # Table 4, and ours
     python plot_curves.py --table test --task p2p --csv p2p.csv       # Table 6
     python plot_curves.py --figure success --task p2p --runs data/runs
-    python plot_curves.py --all figures    # all, and what would fill the gaps
+    python plot_curves.py --all figures    # all, and what our main recipe lacks
     python plot_curves.py --publish data/runs/NAME       # into data/results
     python plot_curves.py --report         # the pages' results, written anew
 
@@ -56,7 +56,9 @@ DRAWINGS = OF_TASK + OF_NO_TASK
 class Flags:
     table: str | None = flag(None, "print a table", choices=(*tables.METRICS, *tables.COMPARED))
     figure: str | None = flag(None, "draw a figure", choices=DRAWINGS)
-    all: Path | None = flag(None, "every table and figure, and the commands that fill the gaps", metavar="FOLDER")
+    all: Path | None = flag(
+        None, "every table and figure, and the commands for what our main recipe lacks", metavar="FOLDER"
+    )
     publish: tuple[Path, ...] | None = flag(None, "run folders, files of pid_demo.py --record", metavar="RUN")
     report: bool = flag(False, "rewrite the results on the pages")
     task: str | None = flag(None, "with --table and --figure", choices=tuple(TASKS))

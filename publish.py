@@ -165,8 +165,11 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "mapping": "Demonstrations of one partition, mapped to all, are better than as they are",
     "symmetry": "Symmetric demonstrations cost less",
     "PID": "The agent beats its demonstrator",
+    "effort": "The agent needs more effort than its demonstrator",
     "quick": "The agent is quicker than its demonstrator (ours)",
 }
+WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "effort": ("T_eff", 1, "points of T_eff"),
+            "quick": ("steps", -1, "steps fewer")}  # {claim: (metric of evaluate.paired, sign, unit)}  # fmt: skip
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
 UNSEEN = "first trial 50000"  # the test study of 500 trials that were never looked at while the recipes were made
@@ -199,6 +202,7 @@ def comparisons(task, runs):
             at_length = [f"{what} {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in others
                          if what.startswith("horizon")]  # fmt: skip
             yield "PID", compared + f" (at the {', '.join(at_length)})" * bool(at_length), found.get(key), theirs, 0
+            yield "effort", compared, found.get(key), theirs, 0
             yield "quick", compared, found.get(key), theirs, 0
         if variant or recipe not in tables.OWN_SYMMETRY:
             continue
@@ -222,28 +226,29 @@ def findings_lines(runs):
     lines, said = [["claim", "task", "compared", "success (%)", "difference", "seeds", ""]], {}
     found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
-        least = 5 if claim == "quick" else 0  # percent: with less, next to no trial is one that both succeed in
+        of_both = claim in ("effort", "quick")
+        least = 5 if of_both else 0  # percent: with less, next to no trial is one that both succeed in
         ours, theirs = ([curves for curves in side or () if curves.success >= least] for side in (one, other))
         if not (ours and theirs):
             continue
         ours_mean, theirs_mean = (np.mean([curves.success for curves in side]) for side in (ours, theirs))
         gap, low, high = tables.difference("P_scs_percent", *([c.success for c in side] for side in (ours, theirs)))
-        if claim in ("PID", "quick"):
-            metric, sign = ("P_scs_percent", 1) if claim == "PID" else ("steps", -1)
+        if claim in WITH_PID:
+            metric, sign, _ = WITH_PID[claim]
             pairs = [evaluate.paired(curves.evaluations[""], theirs[0].evaluations[""]) for curves in ours]
             gap, *ends = evaluate.over_seeds([sign * pair[metric][0] for pair in pairs])
-            low, high = ends if claim == "quick" else np.clip(ends, -100, 100)
+            low, high = ends if of_both else np.clip(ends, -100, 100)
         full = claim == "PID" and theirs_mean >= CEILING
         if not low < high and not (full and low == high):  # a single seed says nothing, nor do seeds without a spread
             continue
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
         if full and high > -MARGIN:
             verdict = "no room above it" + ", and below" * bool(high < 0)
-        if claim == "quick":
+        if of_both:
             both = np.mean([sum(c.evaluations[""].success * theirs[0].evaluations[""].success) for c in ours])
             compared += f", {both:.0f} that both succeed in"
-        unit = "steps fewer" if claim == "quick" else "points"
-        seeds = f"{len(ours)}" if claim in ("PID", "quick") else f"{len(ours)} and {len(theirs)}"
+        *_, unit = WITH_PID.get(claim, ["points"])
+        seeds = f"{len(ours)}" if claim in WITH_PID else f"{len(ours)} and {len(theirs)}"
         said.setdefault(claim, []).append([
             TITLES[task], compared, f"{ours_mean:.1f} and {theirs_mean:.1f}",
             f"{between(gap, low, high, 1)} {unit}", seeds, f"*{verdict}*"])  # fmt: skip

@@ -545,7 +545,7 @@ def main_group(task, runs, recipe=None):
 
 
 def gaps(task, runs):
-    """The commands that fill the gaps in a task's tables and figures, as lines to print."""
+    """The commands that fill the gaps that a task's main group leaves in tables and figures, as lines to print."""
     main, lines, names = main_group(task, runs), [], []
     for column in columns(task).drop_duplicates(COLUMN).itertuples():  # P&P's (400, 15) stands in both of its sweeps
         value = {"lambda": f"={column.lambda_bc:g}", "demos": f"={column.num_demos}"}.get(column.sweep, "")
