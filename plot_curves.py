@@ -290,8 +290,9 @@ def error_figure(task, runs, flags):
         ax.fill_between(t, np.maximum(mean - deviation, 0), mean + deviation, color=COLOURS[0], alpha=0.2, linewidth=0)
         ax.plot(t, mean, color=COLOURS[0], linewidth=1.2)
         ax.axhline(100 * EPSILON, color="k", linestyle=":", linewidth=0.8)
-        ax.set(xlim=(0, None), ylim=(0, None), xlabel="$t$ (s)", ylabel=r"$\Vert e_t\Vert$ (cm)")
+        ax.set(xlabel="$t$ (s)", ylabel=r"$\Vert e_t\Vert$ (cm)")
         ax.set_title(label, fontsize=7)
+    axes[0].set(xlim=(0, None), ylim=(0, None))  # of all that is drawn
     for ax in figure.axes:
         ax.label_outer()
         ax.set_visible(ax.has_data())

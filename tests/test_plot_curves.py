@@ -516,9 +516,10 @@ def test_an_error_curve_is_over_the_successful_trials_and_each_counts_alike_at_e
     write_run(tmp_path / "runs/a", success=(1, 0, 1))  # 3 and 5 steps from 50 to 5 cm
     write_run(tmp_path / "runs/b", success=(0, 0, 1), num_demos=7)
     write_run(tmp_path / "runs/c", success=(0, 0, 0), num_demos=80, lambda_bc=1)
-    write_run(tmp_path / "runs/d", success=(0, 0, 1), num_demos=0, lambda_bc=0)
+    write_run(tmp_path / "runs/d", success=(0, 0, 1, 1), num_demos=0, lambda_bc=0)
     drawn = figure("error")
     ax, plain, own = (ax for ax in drawn.axes if ax.get_visible())
+    assert ax.get_xlim()[1] >= 0.12 and ax.get_ylim()[1] >= 50  # all of every panel is seen
     assert plain.get_title().startswith("$N_{demos}=0$, $\\lambda_{BC}=0$")
     assert ax.get_title() == "$N_{demos}=100$, $\\lambda_{BC}=1.8$\n2 of 3 trials, 1 seed" and "=7$" in own.get_title()
     t, mean = ax.lines[0].get_data()
