@@ -409,7 +409,8 @@ def test_a_study_of_runs_prints_their_rows_and_writes_every_trial(run_folder, tm
     out = capsys.readouterr().out.splitlines()
     assert out[1] == str(run_folder) and out[3].startswith("  3 trials: ") and out[4] == str(other / "policy.pt")
     assert out[8] == f"  minus {other / 'policy.pt'}, the same trials:"
-    assert sorted(path.name for path in run_folder.iterdir()) == ["evaluation.csv", "policy.pt", "trajectories.npz"]
+    assert sorted(path.name for path in run_folder.iterdir()) == [
+        "config.json", "evaluation.csv", "policy.pt", "trajectories.npz"]  # fmt: skip
     text = (run_folder / "evaluation.csv").read_bytes().decode()
     assert text.startswith(HEADER + "\n") and text.count("\n") == 4 and "\r" not in text
     rows, _ = evaluate.run_trials("p2p", run_folder, 3, quiet=True)
@@ -440,7 +441,8 @@ def test_a_study_of_more_trials_is_not_replaced_by_one_of_fewer(run_folder, main
 def test_a_published_study_stays_as_it_is_and_another_one_is_written_beside_it(run_folder, main, capsys):
     (run_folder / "evaluation.csv.gz").write_bytes(b"as it was")
     assert main(run_folder, "--trials", 1) == 0 and "stays as it is" in capsys.readouterr().out
-    assert sorted(path.name for path in run_folder.iterdir()) == ["evaluation.csv.gz", "policy.pt"]
+    assert sorted(path.name for path in run_folder.iterdir()) == [
+        "config.json", "evaluation.csv.gz", "policy.pt"]  # fmt: skip
     assert main(run_folder, "--trials", 1, "--horizon", 9) == 0
     assert (run_folder / "evaluation-horizon_9.csv").exists()
 
