@@ -110,9 +110,7 @@ def resolve(flags):
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     defaults = recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters)
     flags = logx.fill_in(flags, defaults, "ddpg")
-    for name in ("clone_iters", "keep_clone", "demo_noise", "normalize_obs"):
-        if flags.num_demos == 0 and getattr(flags, name) not in (0, defaults[name]):
-            raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
+    pid_demo.check_used(flags, defaults)
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
     if flags.noise_kept == 1:

@@ -349,7 +349,8 @@ def trials_in(path):
 
 
 def write(folder, rows, trajectories, what=""):
-    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published or larger one stays."""
+    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published or larger one stays. Raises
+    BadInput."""
     path = path_of(folder, what)
     published = path.with_name(f"{path.name}.gz")
     if published.exists() or trials_in(path) > len(rows):
@@ -360,9 +361,10 @@ def write(folder, rows, trajectories, what=""):
     table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     table.writeheader()
     table.writerows([{k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows])
-    logx.atomic_write(path, text.getvalue())
-    if not what:
-        logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
+    with pid_demo.writing(path):
+        logx.atomic_write(path, text.getvalue())
+        if not what:
+            logx.atomic_write(folder / "trajectories.npz", lambda file: np.savez_compressed(file, **trajectories))
 
 
 def show(agents, numbers, path=None, quiet=False, **settings):
@@ -371,7 +373,8 @@ def show(agents, numbers, path=None, quiet=False, **settings):
     settings |= dict(render_mode="rgb_array", width=480, height=360) if path else dict(render_mode="human")
     made = {name: make_agent(*agent, **settings) for name, agent in agents.items()}
     if path:
-        film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers}, quiet=quiet)
+        with pid_demo.writing(path):
+            film.film(made, path, {f"trial {i}": FIRST_SEED + i for i in numbers}, quiet=quiet)
         print(f"wrote {path}")
     else:
         (agent,) = made.values()
@@ -387,12 +390,9 @@ def after_training(folder, task, gains, quiet):
     gains = gains or "fast"
     agents = {str(folder): folder, f"PID, {gains} gains": gains}
     found = {name: run_trials(task, source, 100, quiet=quiet) for name, source in agents.items()}
-    try:
-        write(folder, *found[str(folder)])
-        print_table({name: rows for name, (rows, _) in found.items()})
-        show({str(folder): (task, folder)}, range(6), folder / "agent.gif", quiet)
-    except OSError as error:
-        raise logx.BadInput(f"{folder}: cannot be written ({error.strerror})") from None
+    write(folder, *found[str(folder)])
+    print_table({name: rows for name, (rows, _) in found.items()})
+    show({str(folder): (task, folder)}, range(6), folder / "agent.gif", quiet)
 
 
 def print_agents():
@@ -475,22 +475,20 @@ def main():
         return print_agents()
     agents, results = check(flags), {}
     settings = dict(start=flags.start, horizon=flags.horizon)
-    try:
-        if flags.gif or flags.watch:
-            numbers = flags.show or [flags.first_trial + i for i in range(3 if flags.watch else 6)]
-            return show(agents, numbers, flags.gif, **settings)
-        for name, (task, source) in agents.items():
-            found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
-            folder = folder_of(source, flags)
-            if flags.out and source in pid_demo.GAINS and not (folder / "evaluation.csv.gz").exists():
+    if flags.gif or flags.watch:
+        numbers = flags.show or [flags.first_trial + i for i in range(3 if flags.watch else 6)]
+        return show(agents, numbers, flags.gif, **settings)
+    for name, (task, source) in agents.items():
+        found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
+        folder = folder_of(source, flags)
+        if flags.out and source in pid_demo.GAINS and not (folder / "evaluation.csv.gz").exists():
+            config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
+            with pid_demo.writing(f"--out {folder}"):
                 folder.mkdir(parents=True, exist_ok=True)
-                config = {"task": task, "algo": "pid", "gains": source, "versions": logx.versions()}
                 logx.atomic_write(folder / "config.json", json.dumps(config, indent=1))
-            results[name] = found[0]
-            if folder is not None:
-                write(folder, *found, study(task, flags.first_trial, **settings))
-    except OSError as error:
-        raise logx.BadInput(f"{error.filename or flags.gif or name}: cannot be written ({error.strerror})") from None
+        results[name] = found[0]
+        if folder is not None:
+            write(folder, *found, study(task, flags.first_trial, **settings))
     print_table(results, str(flags.versus) if flags.versus else None)
 
 

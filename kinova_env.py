@@ -222,11 +222,11 @@ class KinovaEnv(gymnasium.Env):
     | demo | the start of sector k of K, 0.52, 0.42, each joint +- 0.02 rad | in the sector, [0.4, 0.6), [0.35, 0.55) |
 
     The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. On stage "demo" the
-    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube at
-    whose centre the TCP cannot be with the hand so level (a twelfth of all; some 70 % of these could be grasped from
-    beside), or that lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in
-    collision or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: none of 20,000 goals
-    on each stage, some where sectors are narrow (K > 10); with an explicit goal that is a ValueError.
+    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube at whose
+    centre the TCP cannot be with the hand so level (a twelfth of all; some 70 % of these could be grasped from beside),
+    or that lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in collision
+    or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: none of 20,000 goals on each
+    stage, some where sectors are narrow (K > 10); with an explicit goal that is a ValueError.
 
     ## Episode end
     Terminated: success (norm(e) < 0.05, on P&P with the cube grasped), or collision: `info["collision"]` is "self" for

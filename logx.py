@@ -9,8 +9,8 @@
 A run's folder holds what was asked (config.json), its curves (episodes.csv,
 progress.csv), its checkpoint and its policy. What is on disk is always whole:
 but for the curves, which grow by lines, files are written beside their place,
-fsynced and renamed. On a resume the curves are cut back to the checkpoint, so that a killed and resumed run equals
-one that was never killed.
+fsynced and renamed. On a resume the curves are cut back to the checkpoint, so
+that a killed and resumed run equals one that was never killed.
 """
 
 import argparse

@@ -344,14 +344,22 @@ def demonstrations(flags):
     return {name: demos[name][demos["episode"] < flags.num_demos] for name in ROWS if name in demos}, meta["env_steps"]
 
 
+def check_used(flags, defaults):
+    """Raises BadInput where flags of an algorithm script that need demonstrations are other than its recipe's
+    `defaults`, and there are none."""
+    for name in ("clone_iters", "keep_clone", "demo_noise", "normalize_obs"):
+        if flags.num_demos == 0 and getattr(flags, name, 0) not in (0, defaults.get(name)):
+            raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
+
+
 def inspect(path):
     """Prints what a demonstration file holds, by partition. Raises BadInput."""
     try:
         demos, meta = load_demos(path)
     except ValueError as error:
         raise logx.BadInput(f"--inspect {error}") from None
-    names = {key: "K_P K_D K_I" if key == "gains" else key for key in meta if key not in ("task", "env_steps")}
-    settings = ", ".join(f"{name} {meta[key]}" for key, name in names.items())
+    settings = ", ".join(f"{'K_P K_D K_I' if key == 'gains' else key} {value}"
+                         for key, value in meta.items() if key not in ("task", "env_steps"))  # fmt: skip
     print(f"{path}: {meta['task']}, recorded in {meta['env_steps']:,} steps of the environment; {settings}")
     print("partition  episodes  success %  steps, median [least, most]   return     |a|")
     for k in [*np.unique(demos["partition"]), "all"]:
@@ -397,15 +405,15 @@ def check(flags):
     jobs = [f"--{name}" for name in asked if getattr(flags, name)]
     if len(jobs) != 1:
         raise logx.BadInput(f"--{', --'.join(asked)}: one of them is expected" + f", not {' '.join(jobs)}" * bool(jobs))
-    given = {name for name, value in vars(flags).items() if value != getattr(Flags(), name)}
-    for useless, where in (
-        (given - {"inspect"} if flags.inspect else set(), jobs[0]),
-        ({"noise", "symmetry"} if flags.watch or flags.gif else set(), jobs[0]),
-        ({"symmetry"} if flags.trials else set(), jobs[0]),
-        (set() if TASKS[flags.task].cube else {"clearance"}, f"--task {flags.task}"),
-        (set() if flags.stage == "demo" else {"symmetry", "partitions"}, f"--stage {flags.stage}"),
+    (job,), changed = jobs, {name for name, value in vars(flags).items() if value != getattr(Flags, name)}
+    for there, useless, where in (
+        (flags.inspect, changed - {"inspect"}, job),
+        (flags.watch or flags.gif, {"noise", "symmetry"}, job),
+        (flags.trials, {"symmetry"}, job),
+        (not TASKS[flags.task].cube, {"clearance"}, f"--task {flags.task}"),
+        (flags.stage != "demo", {"symmetry", "partitions"}, f"--stage {flags.stage}"),
     ):
-        for name in sorted(given & useless):
+        for name in sorted(changed & useless) if there else ():
             raise logx.BadInput(f"--{name}: does not go with {where}")
     film.check(flags.gif, flags.watch)
     if bool(flags.record) != bool(flags.out or flags.minari):
@@ -435,12 +443,12 @@ def check_minari(name):
 
 
 @contextlib.contextmanager
-def writing(name, place):
-    """Around what writes to the flag's `place`: raises BadInput where it cannot."""
+def writing(what):
+    """Around what writes files, and prints nothing: raises BadInput that names `what` where it cannot."""
     try:
         yield
     except OSError as error:
-        raise logx.BadInput(f"--{name} {place}: cannot be written ({error.strerror or error})") from None
+        raise logx.BadInput(f"{what}: cannot be written ({error.strerror or error})") from None
 
 
 def show(flags, gains):
@@ -449,7 +457,7 @@ def show(flags, gains):
     env = gymnasium.make(TASKS[flags.task].env_id, render_mode="rgb_array" if flags.gif else "human", **settings)
     pid, seeds = PID(env, gains, flags.clearance), range(flags.seed, flags.seed + 3)
     if flags.gif:
-        with writing("gif", flags.gif):
+        with writing(f"--gif {flags.gif}"):
             film.film({"PID": (env, lambda s: pid.act())}, flags.gif, {f"episode {seed}": seed for seed in seeds})
         print(f"wrote {flags.gif}")
     for seed in () if flags.gif else seeds:
@@ -476,11 +484,11 @@ def main():
         raise logx.BadInput(f"--{error}") from None
     meta = dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings)
     if flags.minari:
-        with writing("minari", flags.minari):
+        with writing(f"--minari {flags.minari}"):
             write_minari(flags.minari, demos, meta)
     if flags.out:
         packed = dict(demos, meta=np.array(json.dumps(meta)))
-        with writing("out", flags.out):
+        with writing(f"--out {flags.out}"):
             logx.atomic_write(flags.out, lambda file: np.savez_compressed(file, **packed))
     won = demos["success"]
     length = f"{demos['length'][won].mean():.0f} steps" if won.any() else "no success"

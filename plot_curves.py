@@ -9,8 +9,8 @@
 
 Without --runs the runs are those in data/results, and in data/runs beside this
 file and in the present folder; runs with flags other than their recipe's stand
-in --table ablations, partitions, and --figure symmetry, success alone then. What the numbers are, and which runs form a
-group: tables.py.
+in --table ablations, partitions, and --figure symmetry, success alone then.
+What the numbers are, and which runs form a group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
 where NAME is results, findings, watched, demonstrator, cost, figures, or
@@ -546,7 +546,7 @@ def main(argv=None):
     if flags.all:
         return print("\n".join(draw_all(flags)))
     if flags.report:
-        publish.report([])  # what is wrong with a page is said before anything is written
+        publish.marked_pages()  # what is wrong with one is said before anything is written
         names = save_figures(tables.RESULTS, tables.find_runs([tables.RESULTS])[0], flags, (".png",), dpi=130)
         figures = [tables.RESULTS / f"{name}.png" for name in names]
         for path in set(tables.RESULTS.glob("fig-*.png")) - set(figures):

@@ -101,9 +101,7 @@ def resolve(flags):
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     defaults = recipe_defaults(flags.task, flags.recipe, flags.num_demos)
     flags = logx.fill_in(flags, defaults, "ppo")
-    for name in ("clone_iters", "demo_noise"):
-        if flags.num_demos == 0 and getattr(flags, name) not in (0, defaults[name]):
-            raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
+    pid_demo.check_used(flags, defaults)
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
     if flags.demos_in_B_o and flags.demo_noise:

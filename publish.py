@@ -172,7 +172,7 @@ WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "effort": ("T_eff", 1, "point
             "quick": ("steps", -1, "steps fewer")}  # {claim: (metric of evaluate.paired, sign, unit)}  # fmt: skip
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
-UNSEEN = "first trial 50000"  # the test study of 500 trials that were never looked at while the recipes were made
+UNSEEN = "first trial 50000"  # the test study of 500 trials that today's DDPG agents had not met; earlier PPO ones had
 
 
 def comparisons(task, runs):
@@ -390,26 +390,34 @@ BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines
 # ---- pages -----------------------------------------------------------------------------------------------------------
 
 
+MARKED = re.compile(r"^<!-- (\S+) -->$.*?^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
+FIGURE_BLOCKS = ("figures", *(f"figures-{task}" for task in TASKS))
+
+
+def marked_pages():
+    """{page: its text}. Raises BadInput for a mark that is alone or of no block, and where no run is published."""
+    if not any(tables.RESULTS.glob("[!.]*/config.json")):
+        raise BadInput(f"--report: no run in {tables.RESULTS}; --publish puts them there")
+    texts = {page: page.read_text(encoding="utf-8") for page in PAGES if page.exists()}
+    for page, text in texts.items():
+        for name in set(MARKED.findall(text)) - {*BLOCKS, *FIGURE_BLOCKS}:
+            raise BadInput(f"{page}: <!-- {name} --> is no block of --report; --help lists them")
+        for name in re.findall(r"^<!-- (\S+) -->$", MARKED.sub("", text), re.MULTILINE):
+            raise BadInput(f"{page}: <!-- {name} --> is one mark alone; its block ends with <!-- /{name} -->")
+    return texts
+
+
 def report(figures):
     """{page: its text with each marked block made anew from data/results}. figures: its .png files, in their order."""
-    runs, _ = tables.find_runs([tables.RESULTS])
+    texts, (runs, _) = marked_pages(), tables.find_runs([tables.RESULTS])
 
     def block(marks, page):
         name = marks[1]
-        if name in ("figures", *(f"figures-{task}" for task in TASKS)):
+        if name in FIGURE_BLOCKS:
             shown = [path for path in figures if path.stem.split("-")[2:3] == name.split("-")[1:]]
             text = "\n\n".join(f"![{path.stem}]({os.path.relpath(path, page.parent)})" for path in shown)
-        elif name in BLOCKS:
-            text = BLOCKS[name](runs)
         else:
-            raise BadInput(f"{page}: <!-- {name} --> is no block of --report; --help lists them")
+            text = BLOCKS[name](runs)
         return f"<!-- {name} -->\n{text}\n<!-- /{name} -->"
 
-    if not len(runs):
-        raise BadInput(f"--report: no run in {tables.RESULTS}; --publish puts them there")
-    marked = re.compile(r"^<!-- (\S+) -->$.*?^<!-- /\1 -->$", re.MULTILINE | re.DOTALL)
-    texts = {page: page.read_text(encoding="utf-8") for page in PAGES if page.exists()}
-    for page, text in texts.items():
-        for name in re.findall(r"^<!-- (\S+) -->$", marked.sub("", text), re.MULTILINE):
-            raise BadInput(f"{page}: <!-- {name} --> is one mark alone; its block ends with <!-- /{name} -->")
-    return {page: marked.sub(partial(block, page=page), text) for page, text in texts.items()}
+    return {page: MARKED.sub(partial(block, page=page), text) for page, text in texts.items()}

@@ -197,7 +197,7 @@ def grid(flags):
     jobs = {}
     for task in flags.task:
         chosen = [setting for name, setting in columns(task).items() if name in (flags.columns or [name])]
-        made = {}  # {folder: the column and the values that make it}
+        made = {}  # {(its column, folder): the values that make it}
         for (algo, N, lam), varied in itertools.product(chosen, combinations(flags.vary)):
             script = importlib.import_module(SCRIPTS[algo])  # here, since torch takes seconds
             setting = {"task": task, "recipe": flags.recipe, "num_demos": f"{N}", "lambda_bc": f"{lam:g}"}
