@@ -5,6 +5,9 @@ import pybullet
 import pytest
 import torch
 
+import plot_curves
+import publish
+import tables
 from kinova_env import ACTIVE_JOINTS, TASKS, URDF
 
 torch.set_num_threads(1)
@@ -45,3 +48,13 @@ def arm():
     arm = Arm()
     yield arm
     pybullet.disconnect(physicsClientId=arm.client)
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """The default folders lie in an empty place, so that no test sees or writes real results."""
+    monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(tables, "RUNS", (tmp_path / "runs",))
+    monkeypatch.setattr(plot_curves, "FIGURES", tmp_path / "figures")
+    monkeypatch.setattr(publish, "TRIALS", 2)
+    monkeypatch.setattr(publish, "PAGES", (tmp_path / "README.md", tmp_path / "results/README.md"))

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from test_algorithms import TINY, checkpoint, demo_arrays, finished_run, rows_of, scripted_run, states
 from torch import nn
 
 import ddpg_demoease as ddpg
 import evaluate
 import gas
 import logx
+from scripted import TINY, checkpoint, demo_arrays, finished_run, rows_of, scripted_run, states
 
 
 @pytest.fixture

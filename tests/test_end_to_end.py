@@ -23,11 +23,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from test_algorithms import SCRIPTS, TINY, checkpoint, curves, rows_of
 from tqdm import tqdm
 
 import kinova_env
 import logx
+from scripted import SCRIPTS, TINY, checkpoint, curves, rows_of
 
 torch.optim.Adam([torch.zeros(1)])  # imports as much again, here once for all processes that are forked
 ROOT = Path(kinova_env.__file__).parent

@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from test_algorithms import DEMO_ENDS, TINY, demo_arrays, finished_run, rows_of, scripted_run, states
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
@@ -18,6 +17,7 @@ import gas
 import logx
 import pid_demo
 import ppo_demoease as ppo
+from scripted import DEMO_ENDS, TINY, demo_arrays, finished_run, rows_of, scripted_run, states
 
 NEVER = 1e9  # a KL limit that is never reached
 ENDS = ["true", "timeout", "cut", "true", "true", "timeout", "timeout", "cut"]

@@ -6,9 +6,9 @@ import signal
 import subprocess
 
 import pytest
-from test_sweep import ENDLESS, SHORT, ends_as_an_unbroken_run, jobs_of, wait_for
 
 import sweep
+from test_sweep import ENDLESS, SHORT, ends_as_an_unbroken_run, jobs_of, wait_for
 
 pytestmark = pytest.mark.root
 CONF = """
