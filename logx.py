@@ -376,7 +376,8 @@ class RunFolder:
             if list(folder.glob("*.csv.gz")):
                 raise BadInput(f"{name}: {folder} is a published run, without the state to go on from; begin a new one")
             lost = (folder / "policy.pt").exists() and not (folder / "checkpoint.pt").exists()
-            if lost and (folder / "progress.csv").read_text().count("\n") > self.flags.checkpoint_every + 1:
+            epochs = folder / "progress.csv"
+            if lost and not (epochs.exists() and epochs.read_text().count("\n") <= self.flags.checkpoint_every + 1):
                 raise BadInput(f"{name}: {folder} has lost its checkpoint.pt; begin a new one")
             self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)

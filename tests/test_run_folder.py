@@ -190,6 +190,9 @@ def test_a_run_that_has_lost_its_checkpoint_keeps_its_curves(stopped):
     with pytest.raises(BadInput, match=f"{stopped} has lost its checkpoint.pt"):
         folder_of(stopped, resume=True)
     assert {path.name: path.read_bytes() for path in stopped.iterdir()} == before
+    (stopped / "progress.csv").unlink()
+    with pytest.raises(BadInput, match=f"{stopped} has lost its checkpoint.pt"):
+        folder_of(stopped, resume=True)
 
 
 def test_a_published_run_is_not_begun_again_in_its_place(tmp_path):
