@@ -162,7 +162,7 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "demos": "More demonstrations are better",
     "plain": "Demo-EASE beats the plain algorithm",
     "mask": "The mask matters",
-    "mapping": "Demonstrations of one partition, mapped to all, are better than as they are",
+    "mapping": "Demonstrations of one partition, mapped to all, are better than as many of all",
     "symmetry": "Symmetric demonstrations cost less",
     "PID": "The agent beats its demonstrator",
     "effort": "The agent needs more effort than its demonstrator",
@@ -182,7 +182,7 @@ def comparisons(task, runs):
     key, ends = (best.num_demos, best.lambda_bc), {}
     for sweep, value in (("lambda", "lambda_bc"), ("demos", "num_demos")):
         rows = printed[(printed.sweep == sweep) & (printed[value] > 0)].sort_values(value)
-        ends[sweep] = [(row.num_demos, row.lambda_bc) for row in (rows.iloc[-1], rows.iloc[0])]
+        ends[sweep] = tuple((row.num_demos, row.lambda_bc) for row in (rows.iloc[-1], rows.iloc[0]))
     pid = {run.recipe: [run.curves] for run in runs[runs.algo == "pid"].itertuples()}
     groups = runs[(runs.algo != "pid") & runs.finished].groupby(GROUP)
     at = {group: {key: list(part.curves) for key, part in members.groupby(COLUMN[1:])} for group, members in groups}
@@ -206,17 +206,20 @@ def comparisons(task, runs):
             yield "quick", compared, found.get(key), theirs, 0
         if variant or recipe not in tables.OWN_SYMMETRY:
             continue
-        for sweep, (high, low) in ends.items():
+        pairs, counts = list(ends.items()), sorted(n for n in found if n[0] and n[1] == best.lambda_bc)
+        if len(counts) > 1:  # as in the study of the symmetries
+            pairs.append(("demos", (counts[-1], counts[0])))
+        for sweep, (high, low) in dict.fromkeys(pairs):
             names = [f"{N} demonstrations, λ_BC = {lam:g}" for N, lam in (high, low)]
             yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low), 0
         plain = [curves for (N, _), part in found.items() if not N for curves in part]
         yield "plain", f"{label}: with demonstrations, and without", found.get(key), plain, 0
         for (N, lam), curves in found.items() if symmetry == "gas" else ():
             recorded, none = curves[0].row["recorded"], at.get((algo, recipe, "none", "", total), {})
-            yield ("mapping", f"{label}: {recorded} recorded and mapped to {N}, and {recorded} as they are", curves,
-                   none.get((recorded, lam)), 0)  # fmt: skip
-            yield ("symmetry", f"{label}: {recorded} recorded and mapped to {N}, and {N} recorded: at most {MARGIN} "
-                   "points worse", curves, none.get((N, lam)), MARGIN)  # fmt: skip
+            mapped = f"{label}: {recorded} recorded in one partition and mapped to {N}"
+            yield ("mapping", f"{mapped}, and {recorded} recorded in all", curves, none.get((recorded, lam)), 0)
+            yield ("symmetry", f"{mapped}, and {N} recorded in all: at most {MARGIN} points worse", curves,
+                   none.get((N, lam)), MARGIN)  # fmt: skip
 
 
 def findings_lines(runs):
@@ -259,7 +262,7 @@ def findings_lines(runs):
 
 def results_lines(runs):
     """For the first page: by task and recipe the paper's best column and the plain algorithm, and the PID."""
-    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "in unseen ones (%)", "seeds",
+    lines = [["task", "agent", "paper", "ours: success in test trials (%)", "in 500 others (%)", "seeds",
               "steps: demonstrated + own", "command", "minutes"]]  # fmt: skip
     for task in PRINTED:
         printed, best = columns(task), best_column(task)
@@ -288,7 +291,7 @@ def results_lines(runs):
             success = success_in(found, "")
             if tables.LATE in found:
                 late = np.mean([metrics["P_scs_percent"] for _, metrics in found[tables.LATE]])
-                success += f"; {late:.1f} over the last fifth of training"
+                success += f"; in validation, over the last fifth of training: {late:.1f}"
             for what in found if column.algo == "pid" else ():
                 success += f"; {what}: {success_in(found, what)}" * what.startswith("horizon")
             unfinished = f" ({sum(~part.finished)} unfinished)" * (not all(part.finished))
@@ -314,7 +317,8 @@ WATCHED = {"pretanh_own (PPO: mean_action_own)": ("pretanh_own", "mean_action_ow
 
 
 def watched_lines(runs):
-    """What went on inside the first page's agents: means over the tenth of the run that ends at a tenth, half, all."""
+    """What went on inside the first page's agents: means over the tenth of a run's epochs that ends at a tenth, half,
+    all of them."""
     lines = [["task", "agent", *WATCHED, "own success (%)"]]
     for task, recipe, algo in product(PRINTED, ("robust", "paper"), ("ddpg", "ppo")):
         of_recipe = runs[(runs.task == task) & (runs.variant == "") & (runs.algo == algo)]

@@ -412,14 +412,18 @@ def table_lines(kind, rows):
 
 def table_notes(kind, rows):
     """What stands below the table, as lines."""
-    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t; as published, * where the paper's lies "
-             "outside it."]  # fmt: skip
+    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t, [-] of seeds all alike; as published, at "
+             "the paper's horizon and start, * where the paper's lies outside it."]  # fmt: skip
     if kind == "training":
-        notes += ["[-]: a single seed has none. T50 is N/A where R90 <= 0 or half of it is not reached; the paper's "
-                  "rule is another (DIFFERENCES 56)."]  # fmt: skip
+        notes += ["A single seed has no interval. R10, R90: mean return of the first and the last tenth (rounded up) "
+                  "of the agent's own episodes; I_R: R90 - R10.",
+                  "T50: the first episode at which the mean of the last 50 exceeds half of R90; N/A where R90 <= 0 or "
+                  "none does. The paper's rule is another (DIFFERENCES 56)."]  # fmt: skip
     else:
         notes += ["A single seed: its interval over trials (P_scs: Wilson's), which knows nothing of other seeds.",
                   "Evaluations in training, of validation trials: the best one is not the last policy's."]  # fmt: skip
+        if "p2po" in rows.task.values:
+            notes += ["The paper's Table 7 says N_demos = 100 of its lambda sweep, its Table 5 250 (DIFFERENCES 39)."]
     ours = rows[(rows.seeds > 0) & (rows.algo != "pid")]
     for group, texts in ours.groupby(GROUP, sort=False).commits:
         notes.append(f"Commits of {group_label(group)}: {', '.join(sorted(set(' '.join(texts).split())))}")
@@ -504,12 +508,13 @@ def make_table(kind, task, runs, variants=False):
         base = {"ablations": "the recipe", "symmetries": "no symmetry", "partitions": "K = 4"}[kind]
         notes = [
             f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch; [-]: no spread to see.",
-            "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (permutation test; 3 "
-            "against 3 are too few for one). Own episodes: all of the training's, exploration included.",
+            "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (two-sided permutation "
+            "test; 3 against 3 are too few for one). Own episodes: all of the training's, exploration included.",
         ]
         if kind == "ablations":
             notes += [
-                "Where the recipe was not run at a variant's length, the reference is its longest runs.",
+                "Where the recipe was not run at a variant's length, the reference is its longest runs, and own "
+                "episodes are not compared.",
                 "While training, each row explores in its own way; without `clone_iters` it begins untrained.",
             ]
         notes, rows = notes if len(lines) > 1 else ["  no runs"], pd.DataFrame(lines[1:], columns=lines[0])

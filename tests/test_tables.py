@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import publish
 import tables
-from run_folders import PID, cell, of_200, table, trials, write_run
+from run_folders import PID, cell, table, trials, write_run
 
 pytestmark = pytest.mark.usefixtures("folders")
 
@@ -213,68 +212,11 @@ def test_partitions_are_compared_with_4_at_as_many_recorded_and_at_as_many_mappe
         ["2", "10", "20", "-100.0 [-]"], ["4", "5", "20", "-"]]  # fmt: skip
 
 
-def test_mapped_demonstrations_may_be_a_margin_worse_than_as_many_recorded_ones(tmp_path):
-    for seed in (0, 1):
-        for symmetry, N, won in (("none", 5, seed), ("none", 20, 199 + seed), ("gas", 20, 199 + seed)):
-            folder = tmp_path / f"runs/{symmetry}{N}-{seed}"
-            write_run(folder, symmetry=symmetry, num_demos=N, success=of_200(won), seed=seed)
-    found = {line[0]: line[3:] for line in publish.findings_lines(tables.find_runs()[0])}
-    assert found[publish.CLAIMS["mapping"]] == ["99.8 and 0.2", "99.5 [98.0, 100.0] points", "2 and 2", "*holds*"]
-    assert found[publish.CLAIMS["symmetry"]] == ["99.8 and 99.8", "0.0 [-1.5, 1.5] points", "2 and 2", "*holds*"]
-
-
-@pytest.mark.parametrize("ours, verdict", [
-    ((200, 199), "holds"), ((0, 1), "does not hold"), ((200, 0), "cannot be told apart"),
-    ((200,), ""), ((200, 200), "")])  # a single seed says nothing, nor do seeds without a spread  # fmt: skip
-def test_a_finding_is_what_the_interval_of_the_difference_says(tmp_path, ours, verdict):
-    for seed, won in enumerate(ours):
-        write_run(tmp_path / f"runs/{seed}", seed=seed, success=of_200(won))
-    write_run(tmp_path / "runs/pid", success=of_200(100), **PID)
-    found = {line[0]: line[-1] for line in publish.findings_lines(tables.find_runs()[0])}
-    assert found["The agent beats its demonstrator"] == (verdict and f"*{verdict}*")
-    assert found["The mask matters"] == ""
-
-
-def test_plain_runs_are_one_algorithm_whatever_their_lambda_and_trials_never_looked_at_have_a_column(tmp_path):
-    for seed, (N, lam, won) in enumerate([(100, 1.8, (1, 1))] * 2 + [(0, 0, (0, 0)), (0, 0, (1, 0)), (0, 1, (1, 1))]):
-        run = write_run(tmp_path / f"runs/{seed}", seed=seed, num_demos=N, lambda_bc=lam, success=won)
-        (run / "evaluation-first_trial_50000.csv").write_text(trials((1, 0)))
-    runs, _ = tables.find_runs()
-    found = {line[0]: line[3:] for line in publish.findings_lines(runs)}
-    assert found[publish.CLAIMS["plain"]][0::2] == ["100.0 and 50.0", "2 and 3"]
-    mine, plain = (line for line in publish.results_lines(runs) if line[0] == "P2P" and line[5])
-    assert (mine[3:6], plain[3].split()[0], plain[5]) == (["100.0 [-]", "50.0 [-]", "2"], "50.0", "3")
-
-
-def test_an_agent_is_compared_with_the_pid_that_it_was_shown_of_which_the_success_is_told(tmp_path):
-    for gains, won in (("authors", 100), ("fast", 200)):
-        write_run(tmp_path / f"runs/pid-{gains}", success=of_200(won), **PID | {"gains": gains})
-    for seed in (0, 1):
-        for variant, gains, won in (("", "fast", 200), ("gains=authors", "authors", 199 + seed)):
-            folder = tmp_path / f"runs/{gains}{seed}"
-            write_run(folder, seed=seed, success=of_200(won), variant=variant, gains=gains)
-    (tmp_path / "runs/pid-authors/evaluation-horizon_600.csv").write_text(trials((1, 1)))
-    lines = publish.findings_lines(tables.find_runs()[0])
-    assert [line[2:] for line in lines if line[0] == "The agent beats its demonstrator"] == [
-        ["ddpg robust mirror 4k steps, and the PID with fast gains in the same trials", "100.0 and 100.0",
-         "0.0 [-] points", "2", "*no room above it*"],
-        ["ddpg robust mirror gains=authors 4k steps, and the PID with authors gains in the same trials (at the horizon "
-         "600 100.0)", "99.8 and 50.0", "49.8 [46.6, 52.9] points", "2", "*holds*"]]  # fmt: skip
-
-
 def test_seeds_that_all_lie_on_one_side_are_marked_where_chance_seldom_does_that():
     assert tables.separated([1, 2, 3], [4, 5, 6, 7, 8]) and tables.separated([9, 9, 9, 9], [1, 1, 1, 8])
     assert not tables.separated([1, 2, 3], [4, 5, 6])  # 1 time in 10
     assert not tables.separated([1, 2, 4], [4, 5, 6, 7, 8]) and not tables.separated([1, 2, math.nan], [4] * 5)
     assert tables.difference("P_scs_percent", [0, 90], [100, 100])[1] == -100
-
-
-def test_what_went_on_inside_is_shown_after_a_tenth_half_and_all_of_a_run(tmp_path):
-    run = write_run(tmp_path / "runs/a")
-    rows = "".join(f"{i},{200 * i},0,{i},{i},nan\n" for i in range(1, 21))
-    (run / "progress.csv").write_text("epoch,env_steps,demo_env_steps,seconds,Q_max,eval_success\n" + rows)
-    (line,) = [line for line in publish.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
-    assert line[1] == "DDPG, robust" and line[6] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
 
 
 # ---- which runs ------------------------------------------------------------------------------------------------------
