@@ -14,7 +14,7 @@ import publish
 import tables
 from logx import BadInput
 from plot_curves import main
-from run_folders import COMMIT, CONFIG, cell, figure, table, trials, write_run
+from run_folders import COMMIT, CONFIG, PID, cell, figure, of_200, table, trials, write_run
 
 pytestmark = pytest.mark.usefixtures("folders")
 
