@@ -28,6 +28,8 @@ import pid_demo
 from kinova_env import OBS_DIM, TASKS, grasped
 from logx import flag
 
+ALGO = "ddpg"  # in a run's name and the tables; a copy of this file is another algorithm, with another name
+
 # ---- flags -----------------------------------------------------------------------------------------------------------
 
 
@@ -36,16 +38,12 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(
-        None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400, with --demos: all of them", low=0
-    )
+    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1, high=100)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
-    demos: str | None = flag(
-        None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"
-    )
+    demos: str | None = flag(None, "a recording of pid_demo.py, or minari:NAME, in place of own ones", metavar="FILE")
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 1; 5 T steps an epoch: the authors' code)
     epochs: int | None = flag(None, "N_ep; p2p 250, p2po 500, pnp 250; robust: 25, 40, 25", low=1)
@@ -69,9 +67,7 @@ class Flags(logx.RunFlags):
     timeout_ends: bool = flag(False, "a timeout ends bootstrapping too (zeta as Sec. 3.2 prints it)")
     # the parts of the robust recipe (ours)
     demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
-    noise_kept: float | None = flag(
-        None, "of the exploration noise of a step in the next, 20 ms later; 0, robust: 0.9", low=0, high=1
-    )
+    noise_kept: float | None = flag(None, "of exploration noise, 20 ms later; 0, robust: 0.9", low=0, high=1)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
     keep_clone: float | None = flag(None, "weight of staying near that clone in states of B_o; 0, robust: 10", low=0)
@@ -109,7 +105,7 @@ def resolve(flags):
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     defaults = recipe_defaults(flags.task, flags.recipe, flags.max_ep_len, flags.clone_iters)
-    flags = logx.fill_in(flags, defaults, "ddpg")
+    flags = logx.fill_in(flags, defaults, ALGO)
     pid_demo.check_used(flags, defaults)
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
@@ -247,7 +243,7 @@ def mask(Q_demo, Q_own):
 
 
 def loss_BC(a_demo, a_hat, M):
-    """Eq. 7, averaged over the batch and the 4 actions."""
+    """Eq. 7, averaged over the batch and the 4 actions; of `clone` too, with M = 1."""
     return (M.unsqueeze(-1) * (a_demo - a_hat) ** 2).mean()
 
 
@@ -372,7 +368,7 @@ def train(flags):
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)
-    with logx.RunFolder(flags, "ddpg", MEASURED) as run:
+    with logx.RunFolder(flags, ALGO, MEASURED) as run:
         if not run.finished():
             loop(flags, run)
     return run.folder
@@ -437,9 +433,8 @@ def loop(f, run):
             run.log_epoch(t, lambda: evaluate.while_training(learner.policy(), f))
         if run.must_save(t):
             parts = {"learner": learner.state(), "B_o": B_o.state(), "B_d": B_d and B_d.state(), "env": env.state()}
-            parts |= {"t": t, "noise": noise.tolist(), "rng": rng.bit_generator.state,
-                      "torch_rng": torch.get_rng_state()}  # fmt: skip
-            run.save(parts, learner.policy())
+            rngs = {"rng": rng.bit_generator.state, "torch_rng": torch.get_rng_state()}
+            run.save(parts | rngs | {"t": t, "noise": noise.tolist()}, learner.policy())
             run.stop_if_asked(t)
     env.close()
 

@@ -21,13 +21,16 @@ import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-# By observation width, 22 or 25: where the entries begin that rotate in each way; and one of its tasks (P2P-O and P&P
-# have the same sectors).
+# By observation width, 22 or 25: where the entries begin that rotate in each way; and one of its tasks, which all have
+# the same layout and sectors.
 _ROTATES, _TASK = {}, {}
 for _task, _layout in OBSERVATION.items():
-    _ROTATES[OBS_DIM[_task]], _TASK[OBS_DIM[_task]] = {}, _task
+    _first = _TASK.setdefault(OBS_DIM[_task], _task)
+    if (_layout, TASKS[_task].sector_offset) != (OBSERVATION[_first], TASKS[_first].sector_offset):
+        raise ValueError(f"tasks {_first} and {_task}: of one observation width, not of one layout or sector_offset")
+    _ROTATES[OBS_DIM[_task]] = {how: [] for how in ("angle", "sine", "cosine", "", "vector")}
     for _name, _, _how in _layout:
-        _ROTATES[OBS_DIM[_task]].setdefault(_how, []).append(INDEX[_task][_name].start)
+        _ROTATES[OBS_DIM[_task]][_how].append(INDEX[_task][_name].start)
 
 
 def _library(obs):
@@ -134,6 +137,7 @@ def seen(obs, symmetry):
     return _VIEWS[symmetry](obs)
 
 
+# What one also does with a batch, as so2 and mirror do, is in ReplayBuffer.sample (DDPG) and Learner.demo_batch (PPO).
 _VIEWS = dict.fromkeys(("none", "gas", "so2"), lambda obs: obs)
 _VIEWS |= {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}
 SYMMETRIES = tuple(_VIEWS)  # of --symmetry; whatever maps demonstrations also asks for "gas" by name

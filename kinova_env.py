@@ -34,7 +34,10 @@ class Task:
     test_theta: float  # start angle of the test study
 
 
-TASKS = {  # a new one also needs OBSERVATION, TASK_DEFAULTS in the algorithm files, TITLES in tables.py
+# A new one also needs a row in OBSERVATION (P_g and e first among vectors; BOUND), what is its own in _draw, step and
+# PID.act, TASK_DEFAULTS (for --recipe robust ROBUST_TASK too) in the algorithm files, and TITLES in tables.py; tests
+# are then of it too. sweep.py runs the paper's. --symmetry mirror, which is robust's, needs a task that has this one.
+TASKS = {
     "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4),
     "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2),
     "pnp": Task("KinovaPnP-v0", 800, 1.0, "object", 0.0, -math.pi / 2),

@@ -31,7 +31,7 @@ import film
 import gas
 import kinova_env
 import logx
-from kinova_env import EPSILON, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
+from kinova_env import EPSILON, INDEX, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
 # m: how far the arm's links keep from P2P-O's cube; how far before P&P's cube the approach begins, at most
@@ -216,9 +216,11 @@ def load_demos(path, task=None):
         if not len(demos["length"]):
             raise ValueError("it has no episode")
         demos = {name: column for name, column in demos.items() if name in ROWS | EPISODES}
+        if missing := (ROWS | EPISODES).keys() - {"executed", "effort"} - demos.keys():
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         rows, episodes, width = demos["length"].sum(), len(demos["length"]), OBS_DIM[meta["task"]]
         columns = {"obs": (width,), "obs2": (width,), "act": (4,), "executed": (4,)}
-        for name in (ROWS | EPISODES).keys() - ({"executed", "effort"} - demos.keys()):
+        for name, dtype in ((name, dtype) for name, dtype in (ROWS | EPISODES).items() if name in demos):
             shape = (rows if name in ROWS else episodes, *columns.get(name, ()))
             if demos[name].shape != shape:
                 raise ValueError(f"its {name} is {demos[name].shape}, {shape} is expected")
@@ -226,12 +228,20 @@ def load_demos(path, task=None):
                 raise ValueError(f"nan or inf in its {name}")
             if name in ("act", "executed") and np.abs(demos[name]).max(initial=0) > 1:
                 raise ValueError(f"its {name} leaves [-1, 1]")
+            demos[name] = demos[name].astype(dtype)
         if not np.array_equal(demos["episode"], np.repeat(np.arange(episodes), demos["length"])):
             raise ValueError("its episode does not count from 0 as its length says")
-        if not (demos["terminated"] | demos["truncated"])[np.cumsum(demos["length"]) - 1].all():
-            raise ValueError("an episode's last step is neither terminated nor truncated")
+        ends = np.flatnonzero(demos["terminated"] | demos["truncated"])
+        if not np.array_equal(ends, np.cumsum(demos["length"]) - 1):
+            raise ValueError("an episode ends, terminated or truncated, at another step than its last")
+        for name in ("obs", "obs2"):
+            q, sine = (demos[name][:, INDEX[meta["task"]][part]] for part in ("q", "sin q"))
+            if np.abs(np.sin(q) - sine).max() > 1e-3:
+                raise ValueError(f"its {name} has other sines than those of its angles, in rad")
         if [type(meta[key]) for key in ("env_steps", "partitions", "symmetry")] != [int, int, str]:
             raise ValueError("its meta lacks env_steps, partitions or symmetry")
+        if np.any(demos["partition"] >= meta["partitions"]):
+            raise ValueError(f"it has a partition above {meta['partitions'] - 1}")
     except ImportError:
         raise ValueError(f"{path}: needs pip install -e '.[minari]'") from None
     except FileNotFoundError:
@@ -312,8 +322,9 @@ def given(path, task, symmetry, partitions):
     if symmetry == "gas" and meta["symmetry"] != "gas":
         demos = gas.aggregate(demos, partitions)
     if not len(demos["length"]):
+        others = ", ".join(name for name in gas.SYMMETRIES if name != "gas")
         raise logx.BadInput(f"--demos {path}: has no episode of partition 0, which --symmetry gas maps to the others; "
-                            "others: --symmetry none, so2, canonical, cylinder or mirror")  # fmt: skip
+                            f"allowed: --symmetry {others}")  # fmt: skip
     return demos, meta
 
 

@@ -29,6 +29,8 @@ import pid_demo
 from kinova_env import OBS_DIM, TASKS, grasped
 from logx import flag
 
+ALGO = "ppo"  # in a run's name and the tables; a copy of this file is another algorithm, with another name
+
 # ---- flags -----------------------------------------------------------------------------------------------------------
 
 
@@ -37,16 +39,12 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("pnp", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(
-        None, "N_demos, episodes in B_d; p2p 100, p2po 250, pnp 400, with --demos: all of them", low=0
-    )
+    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0)
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1, high=100)
     gains: str | None = flag(None, "the demonstrator's; paper: authors, robust: fast", tuple(pid_demo.GAINS))
-    demos: str | None = flag(
-        None, "instead of own recordings: a file of pid_demo.py --record, or minari:NAME", metavar="FILE"
-    )
+    demos: str | None = flag(None, "a recording of pid_demo.py, or minari:NAME, in place of own ones", metavar="FILE")
     seed: int = flag(0, "of networks, exploration, goals and demonstrations", low=0, high=2**32 - 1)
     # length (Table 2)
     epochs: int = flag(50, "N_ep", low=1)
@@ -100,7 +98,7 @@ def resolve(flags):
     if flags.demos and flags.num_demos is None:
         flags = replace(flags, num_demos=pid_demo.all_of(flags, PAPER if flags.recipe == "paper" else ROBUST))
     defaults = recipe_defaults(flags.task, flags.recipe, flags.num_demos)
-    flags = logx.fill_in(flags, defaults, "ppo")
+    flags = logx.fill_in(flags, defaults, ALGO)
     pid_demo.check_used(flags, defaults)
     if flags.grasp_input and flags.task != "pnp":
         raise logx.BadInput(f"--grasp_input: --task {flags.task} has nothing to grasp; allowed on --task pnp")
@@ -234,7 +232,7 @@ def mask(V_demo, r_demo):
 
 
 def loss_BC(a_demo, a_hat, M):
-    """Eq. 7, averaged over the batch and the 4 actions."""
+    """Eq. 7, averaged over the batch and the 4 actions; of `clone` too, with M = 1."""
     return (M.unsqueeze(-1) * (a_demo - a_hat) ** 2).mean()
 
 
@@ -372,7 +370,7 @@ def train(flags):
     torch.set_num_threads(1)  # the networks are small: more threads would wait for each other
     torch.set_flush_denormal(True)
     flags = resolve(flags)
-    with logx.RunFolder(flags, "ppo", MEASURED) as run:
+    with logx.RunFolder(flags, ALGO, MEASURED) as run:
         if not run.finished():
             loop(flags, run)
     return run.folder

@@ -198,7 +198,7 @@ def find_runs(named=None):
     remarks to print). Of one configuration and seed there is one run: the finished, longest, most tested, own
     one."""
     rows, remarks = {}, []
-    for folder in named or (RESULTS, *RUNS):
+    for folder in {folder.resolve(): folder for folder in named or (RESULTS, *RUNS)}.values():
         found = sorted(path for path in folder.resolve().rglob("config.json") if not path.parent.name.startswith("."))
         if named and not found:
             raise BadInput(f"--runs {folder}: no run there; a folder that holds config.json, or such folders, expected")
@@ -344,7 +344,7 @@ def table(kind, task, runs):
                     run.curves.evaluations[what] for run, _ in seeds if kind == "test" and what not in (BEST, LATE)
                 ]
                 of_group["trials"] = " ".join(map(str, sorted(set(map(len, tested)))))
-                of_group["commits"] = " ".join(sorted({run.commit[:7] for run, _ in seeds}))
+                of_group["commits"] = " ".join(sorted({run.commit[:7] + run.commit[40:] for run, _ in seeds}))
                 for metric, digits in METRICS[kind].items():
                     values = np.array([metrics.get(metric, math.nan) for _, metrics in seeds])
                     (mean, low, high), method = over_seeds(metric, values), "over seeds"

@@ -1,6 +1,8 @@
 """gas.py: the symmetry against the simulator, the group law, types and shapes, partitions and aggregation."""
 
 import math
+import runpy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +17,15 @@ PI = math.pi
 CUBES = [task for task in TASKS if TASKS[task].cube]
 ANGLES = [PI / 2, PI, 1.234, -2.5]
 ROWS = ("obs", "act", "rew", "obs2", "terminated", "truncated", "episode")
+
+
+@pytest.mark.parametrize("how, offset", [("vector", 0.5), ("vecotr", 0.0), ("", 0.0)])
+def test_of_one_observation_width_there_is_one_layout_and_one_set_of_sectors(monkeypatch, how, offset):
+    """The maps know a task by the width alone; another layout would silently be turned as the first one's is."""
+    monkeypatch.setitem(OBSERVATION, "pnp", [*OBSERVATION["p2po"][:-1], ("P_o", 3, how)])
+    monkeypatch.setitem(TASKS, "pnp", replace(TASKS["pnp"], sector_offset=offset))
+    with pytest.raises(ValueError, match="p2po and pnp"):
+        runpy.run_path(gas.__file__)
 
 
 def rollout(task, actions, options, stage="train", partitions=4):

@@ -363,8 +363,7 @@ def test_file_of_each_task_is_written_and_read_as_that_task_and_no_other(monkeyp
 
 
 def test_record_replaces_an_older_file(monkeypatch, tmp_path):
-    out = tmp_path / "demos.npz"
-    out.write_text("an older one")
+    (out := tmp_path / "demos.npz").write_text("an older one")
     run(monkeypatch, "--record", 1, "--out", out, "--gains", "fast")
     assert len(load_demos(out, "p2p")[0]["length"]) == 1
 
@@ -403,6 +402,9 @@ BROKEN = {  # how a good file is spoilt
     "act above 1": lambda path, good: save(path, good | {"act": good["act"] * 50}),
     "episodes from 1": lambda path, good: save(path, good | {"episode": good["episode"] + 1}),
     "no end": lambda path, good: save(path, good | {end: good[end] & False for end in ("terminated", "truncated")}),
+    "an end amid an episode": lambda path, good: save(path, good | {"truncated": good["truncated"] | True}),
+    "angles in degrees": lambda path, good: save(path, good | {"obs": good["obs"] * ([57.3] * 4 + [1] * 18)}),
+    "no such partition": lambda path, good: save(path, good | {"partition": good["partition"] + 4}),
     "meta not JSON": lambda path, good: save(path, good | {"meta": np.array("{")}),
     "meta without a task": lambda path, good: save(path, good | {"meta": np.array("{}")}),
     "of an unknown task": lambda path, good: save(path, good | {"meta": np.array('{"task": "fly"}')}),
