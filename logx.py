@@ -193,14 +193,14 @@ NOT_A_VARIANT = FREE | {"task", "recipe", "num_demos", "lambda_bc", "symmetry", 
 
 def recorded(cls, asked):
     """The flags, a `cls`, that the run in the folder asked["resume"] was begun with, but for what is `asked` for now,
-    {flag: value}, and how loud it was. Raises BadInput where the folder holds no run of this script."""
+    {flag: value}, and how loud it was; newer flags at their default. Raises BadInput where no run of this is there."""
     folder = Path(asked["resume"])
     folder = folder.resolve() if folder.name in ("", "..") else folder
     try:
         config = json.loads((folder / "config.json").read_text())
-        fields = {field.name for field in dataclasses.fields(cls)}
+        fields = {field.name: field.default for field in dataclasses.fields(cls)}
         before = {name: tuple(v) if isinstance(v, list) else v for name, v in config.items() if name in fields}
-        if missing := fields - set(before):
+        if missing := {name for name in fields if fields[name] is None} - set(before):
             raise ValueError(f"its config.json, of {config.get('algo')}, lacks {len(missing)} of this script's flags")
     except (OSError, ValueError, AttributeError) as error:
         raise BadInput(f"--resume {folder}: must be a run's folder ({one_line(error)})") from None
@@ -403,12 +403,12 @@ class RunFolder:
             raise BadInput(f"--resume: {error}") from None
 
     def _same_run(self):
-        """A checkpoint continues only the run it was made by: every flag but how long and how loud must agree."""
-        saved, path = self.checkpoint, self.folder / "checkpoint.pt"
+        """A checkpoint continues a run of the same flags only, but for length and noise; flags it lacks: by default."""
+        saved, path, now = self.checkpoint, self.folder / "checkpoint.pt", self._config
         parts = {"format", "config", "log", "log_bytes", "seconds"}
         if not isinstance(saved, dict) or not parts <= set(saved) or saved["format"] != FORMAT:
             raise BadInput(f"{path}: of another version of this code; begin a new --name")
-        before, now = json.loads(saved["config"]), self._config
+        before = {field.name: field.default for field in dataclasses.fields(self.flags)} | json.loads(saved["config"])
         if before["algo"] != now["algo"]:
             raise BadInput(f"{path}: a run of {before['algo']}, not of {now['algo']}")
         for key in sorted(set(now) | set(before)):

@@ -182,6 +182,18 @@ def test_a_resume_without_a_checkpoint_begins_a_new_run_and_says_so(tmp_path, ca
     assert capsys.readouterr().out.startswith(f"{run.folder}: no checkpoint there, so this begins a new run\n")
 
 
+def test_a_run_has_the_default_of_a_flag_that_is_newer_and_goes_on_with_no_other(stopped):
+    saved = torch.load(stopped / "checkpoint.pt", weights_only=True)
+    config = {name: value for name, value in json.loads(saved["config"]).items() if name != "gamma"}
+    torch.save(saved | {"config": json.dumps(config)}, stopped / "checkpoint.pt")
+    (stopped / "config.json").write_text(json.dumps(config | {"versions": {}}))
+    assert logx.recorded(Flags, {"resume": str(stopped)}).gamma == 0.99
+    with pytest.raises(BadInput, match="made with --gamma 0.99, not 0.5"):
+        folder_of(stopped, resume=True, gamma=0.5)
+    with folder_of(stopped, resume=True) as run:
+        assert run.checkpoint["t"] == 50
+
+
 def test_a_run_that_has_lost_its_checkpoint_keeps_its_curves(stopped):
     (stopped / "checkpoint.pt").unlink()
     with open(stopped / "progress.csv", "a") as file:
