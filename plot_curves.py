@@ -13,10 +13,10 @@ in --table ablations, partitions, and --figure symmetry, success alone then.
 What the numbers are, and which runs form a group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
-where NAME is results, findings, watched, demonstrator, cost, figures, or
-training, test, ablations, symmetries, partitions, figures with -p2p, -p2po,
--pnp. --report rewrites what is between them in README.md, DIFFERENCES.md and
-data/results/README.md from data/results, and draws the figures there.
+where NAME is results, verdicts, findings, watched, demonstrator, parts, cost,
+figures, or training, test, ablations, symmetries, partitions, figures with
+-p2p, -p2po, -pnp. --report rewrites what is between them in README.md,
+DIFFERENCES.md and data/results/README.md from data/results, and draws there.
 """
 
 import math
@@ -103,6 +103,10 @@ def caption(figure, *sentences):
     figure.supxlabel(textwrap.fill(" ".join(filter(None, sentences)), width), fontsize=6.5, color=GREY)
 
 
+BAND = "Mean over seeds and its 95 % band (Student)."
+THIN = "Thin: the mean of those that go on, once the shortest run of a column has ended."
+
+
 def draw_band(ax, x, values, label, metric="", **look):
     """The mean of values (seeds, n) over x, and its Student band where there are two seeds."""
     mean, low, high = np.transpose([tables.over_seeds(metric, seeds) for seeds in values.T])
@@ -140,7 +144,7 @@ def named_learning_figure(task, lines):
     ax.set(xlabel="episode", ylabel=f"return (mean of last {tables.WINDOW} episodes)", xlim=(0, None))
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17))
     figure.suptitle(TITLES[task], fontsize=9)
-    caption(figure, "Mean over seeds and its 95 % band (Student); thin: the seeds that go on after the shortest.")
+    caption(figure, BAND, THIN)
     return figure
 
 
@@ -168,7 +172,7 @@ def learning_figure(task, runs, flags):
             draw_curve(ax, of_column(group, column), column_label(column), **look)
             if math.isfinite(column.R90):
                 ax.axhline(column.R90, color=look["color"], linestyle=":", linewidth=0.8, zorder=1)
-        ax.plot([], [], "k:", linewidth=0.8, label=r"the paper's $\overline{R}_{90}$")
+        ax.plot([], [], "k:", linewidth=0.8, label=r"the paper's $\overline{R}_{90}$, in its line's colour")
         varied, fixed = (r"$\lambda_{BC}$", "demos") if sweep == "lambda" else ("$N_{demos}$", "lambda")
         at = [column_label(column, fixed) for column in drawn if column.sweep == sweep]
         ax.set(title=f"effect of {varied} at {at[0]}" if at else "", xlabel="episode", xlim=(0, None))
@@ -177,8 +181,7 @@ def learning_figure(task, runs, flags):
     ends = min(heights) - 0.5, max(heights) + 0.5  # not those of the bands: two seeds' would set the scale
     axes[0].set(ylim=ends, ylabel=f"return (mean of last {tables.WINDOW} episodes)")
     hidden = title(figure, task, group, runs)
-    caption(figure, "Mean over seeds and its 95 % band (Student); thin: the seeds that go on after the shortest.",
-            f"No runs yet: {', '.join(empty)}." if empty else "", hidden)  # fmt: skip
+    caption(figure, BAND, THIN, f"No runs yet: {', '.join(empty)}." if empty else "", hidden)
     return figure
 
 
@@ -206,15 +209,15 @@ def success_figure(task, runs, flags):
     ax = figure.add_subplot()
     for i, (label, trials) in enumerate(sorted(lines.items(), key=lambda line: -line[1].mean(axis=None))):
         draw_band(ax, trials.index, trials.to_numpy().T, label, "P_scs_percent", marker=".", markersize=4, **style(i))
-    ax.set(xlabel="environment steps", ylabel="success in trials while training (%)", ylim=(-2, 102), xscale="log")
+    ax.set(xlabel="environment steps", ylabel="success in validation trials (%)", ylim=(-2, 102), xscale="log")
     ticks = [n * 10**k for k in range(3, 7) for n in (1, 2, 5) if ax.get_xlim()[0] <= n * 10**k <= ax.get_xlim()[1]]
     ax.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
     ax.minorticks_off()
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     figure.suptitle(f"{TITLES[task]}: {best.algo.upper()} at {column_label(best, 'both')} where not said otherwise")
     hidden = len(runs[COLUMN].drop_duplicates()) - len(shown[COLUMN].drop_duplicates())
-    caption(figure, "Mean over seeds and its 95 % band (Student). Where lengths alone differ, the longest runs.",
-            f"Not drawn: {hidden} other columns; --runs draws all." if hidden else "")  # fmt: skip
+    caption(figure, BAND, "Where lengths alone differ, the longest runs.",
+            f"Not drawn: {hidden} other pairs of $N_{{demos}}$ and $\\lambda_{{BC}}$." if hidden else "")  # fmt: skip
     return figure
 
 
@@ -238,21 +241,26 @@ def symmetry_figure(task, runs, flags):
     panels = [x for x in lines if lines[x]]
     figure = Figure(figsize=(3.2 * len(panels) + 0.8 * (len(panels) == 1), 3.2), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    looks = iter(range(99))  # no colour twice
     for ax, x in zip(axes, panels, strict=True):
         for i, (label, part) in enumerate(lines[x].items()):
+            look = style(next(looks))
             part = part.sort_values("num_demos").drop_duplicates(["seed", x], keep="last")
             values = part.groupby(x).success.agg(list)
             n = sorted(set(map(len, values)))
             label += f" ({' to '.join(map(str, dict.fromkeys((n[0], n[-1]))))} seed{'s' * (n[-1] > 1)})"
             mean, low, high = np.transpose([tables.over_seeds("P_scs_percent", seeds) for seeds in values])
             at = values.index * 1.03 ** (i - (len(lines[x]) - 1) / 2)  # side by side
-            ax.plot(at, mean, label=label, linewidth=1.1, marker=".", **style(i))
-            ax.errorbar(at, mean, (mean - low, high - mean), fmt="none", ecolor=style(i)["color"], elinewidth=0.7)
+            ax.plot(at, mean, label=label, linewidth=1.1, marker=".", **look)
+            ax.errorbar(at, mean, (mean - low, high - mean), fmt="none", ecolor=look["color"], elinewidth=0.7)
             single = values.map(len) == 1
             ax.scatter(at[single], mean[single], 4, color="w", zorder=3)
-        texts = {"recorded": "recorded demonstrations", "K": "number of partitions $K$"}
-        ax.set(xscale="log", xlabel=texts[x], ylim=(-2, 102))
-        ticks = sorted({value for part in lines[x].values() for value in part[x]})
+        texts = {"recorded": ("recorded demonstrations", "all symmetries, $K=4$"),
+                 "K": ("number of partitions $K$", "the paper's map (gas), all $K$")}  # fmt: skip
+        ax.set(xscale="log", xlabel=texts[x][0], title=texts[x][1], ylim=(-2, 102))
+        ticks = []  # those of which the texts do not overlap
+        for tick in sorted({value for part in lines[x].values() for value in part[x]}, reverse=True):
+            ticks += [tick] * (not ticks or ticks[-1] / tick > 1.4)
         ax.set_xticks(ticks, [f"{tick}" for tick in ticks])
         ax.minorticks_off()
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=1 + (x == "recorded"))
@@ -296,6 +304,9 @@ def error_figure(task, runs, flags):
     for ax in figure.axes:
         ax.label_outer()
         ax.set_visible(ax.has_data())
+    for ax in figure.axes[max(0, len(panels) - across) : len(panels)]:  # the lowest of each column
+        ax.tick_params(labelbottom=True)
+        ax.set_xlabel("$t$ (s)")
     if of_all:
         hidden = ""
         figure.suptitle(TITLES[task], fontsize=9)
@@ -353,7 +364,7 @@ def draw_paths(task, paths, text):
     space.set_box_aspect((1.4, 1.4, 0.6), zoom=1.0)
     space.view_init(elev=28, azim=-60)
     space.tick_params(pad=-2)
-    figure.suptitle(f"{TITLES[task]}: {text}", fontsize=8.5)
+    figure.suptitle(f"{TITLES[task]}: {text}; colours: the goal's sector", fontsize=8.5)
     lines = [Line2D([], [], linestyle="", marker=marker, color=colour or "w", markeredgecolor="k", markersize=5,
                     markeredgewidth=0.4, label=label)
              for label, (marker, colour, _) in list(marks.items())[: 2 if task == "p2p" else 3]]  # fmt: skip
@@ -428,7 +439,7 @@ def partitions_figure(task=None, runs=None, flags=None):
         curves.plot(K, means, color=colour, marker=marker, markersize=3, linewidth=1.2, label=label)
         curves.fill_between(K, *ends, color=colour, alpha=0.18, linewidth=0)
     curves.axvspan(3.6, 4.4, color=COLOURS[3], alpha=0.3, linewidth=0, label="$K=4$")
-    curves.set(xlabel="number of partitions $K$", ylabel="length", xticks=K, ylim=(0, None))
+    curves.set(xlabel="number of partitions $K$", ylabel="ratio of lengths", xticks=K, ylim=(0, None))
     curves.legend(title="mean and middle half\nof 1,000 random paths")
     return figure
 

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import shutil
+from collections import Counter
 from functools import partial
 from itertools import product
 
@@ -165,10 +166,13 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "mapping": "Demonstrations of one partition, mapped to all, are better than as many of all",
     "symmetry": "Symmetric demonstrations cost less",
     "PID": "The agent beats its demonstrator",
+    "error": "The agent ends nearer to the goal than its demonstrator",
+    "return": "The agent's return is larger than its demonstrator's",
     "effort": "The agent needs more effort than its demonstrator",
     "quick": "The agent is quicker than its demonstrator (ours)",
 }
-WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "effort": ("T_eff", 1, "points of T_eff"),
+WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "error": ("E_95_cm", -1, "cm less"),
+            "return": ("R_test", 1, "of R_test"), "effort": ("T_eff", 1, "points of T_eff"),
             "quick": ("steps", -1, "steps fewer")}  # {claim: (metric of evaluate.paired, sign, unit)}  # fmt: skip
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
@@ -202,8 +206,8 @@ def comparisons(task, runs):
             at_length = [f"{what} {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in others
                          if what.startswith("horizon")]  # fmt: skip
             yield "PID", compared + f" (at the {', '.join(at_length)})" * bool(at_length), found.get(key), theirs, 0
-            yield "effort", compared, found.get(key), theirs, 0
-            yield "quick", compared, found.get(key), theirs, 0
+            for claim in [claim for claim in WITH_PID if claim != "PID"]:
+                yield claim, compared, found.get(key), theirs, 0
         if variant or recipe not in tables.OWN_SYMMETRY:
             continue
         pairs, counts = list(ends.items()), sorted(n for n in found if n[0] and n[1] == best.lambda_bc)
@@ -229,12 +233,13 @@ def findings_lines(runs):
     lines, said = [["claim", "task", "compared", "success (%)", "difference", "seeds", ""]], {}
     found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
-        of_both = claim in ("effort", "quick")
+        of_both = claim in WITH_PID and claim != "PID"  # of the trials that both succeed in
         least = 5 if of_both else 0  # percent: with less, next to no trial is one that both succeed in
         ours, theirs = ([curves for curves in side or () if curves.success >= least] for side in (one, other))
         if not (ours and theirs):
             continue
         ours_mean, theirs_mean = (np.mean([curves.success for curves in side]) for side in (ours, theirs))
+        metric = "P_scs_percent"
         gap, low, high = tables.difference("P_scs_percent", *([c.success for c in side] for side in (ours, theirs)))
         if claim in WITH_PID:
             metric, sign, _ = WITH_PID[claim]
@@ -254,9 +259,24 @@ def findings_lines(runs):
         seeds = f"{len(ours)}" if claim in WITH_PID else f"{len(ours)} and {len(theirs)}"
         said.setdefault(claim, []).append([
             TITLES[task], compared, f"{ours_mean:.1f} and {theirs_mean:.1f}",
-            f"{between(gap, low, high, 1)} {unit}", seeds, f"*{verdict}*"])  # fmt: skip
+            f"{between(gap, low, high, METRICS['test'].get(metric, 1))} {unit}", seeds, f"*{verdict}*"])  # fmt: skip
     for claim, sentence in CLAIMS.items():
         lines += [[sentence, *line] for line in said.get(claim, [["", "not yet run with two seeds a side", *[""] * 4]])]
+    return lines
+
+
+def verdicts_lines(runs):
+    """The findings at a glance: by claim and task the verdict with its number, of several comparisons in how many."""
+    found = findings_lines(runs)[1:]
+    lines = [["claim", *(TITLES[task] for task in PRINTED)]]
+    for sentence in CLAIMS.values():
+        cells = []
+        for title in lines[0][1:]:
+            said = [(line[-1].strip("*"), line[4]) for line in found if line[:2] == [sentence, title]]
+            counts = Counter(verdict for verdict, _ in said).most_common()
+            cells.append(": ".join(said[0]) if len(said) == 1 else
+                         "; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-")  # fmt: skip
+        lines.append([sentence, *cells])
     return lines
 
 
@@ -310,7 +330,8 @@ def success_in(found, what):
     return between(mean, *ends, 1)
 
 
-WATCHED = {"pretanh_own (PPO: mean_action_own)": ("pretanh_own", "mean_action_own"),
+WATCHED = {"L_O": ("L_O",), "L_BC": ("L_BC",), "L_keep": ("L_keep",),
+           "pretanh_own (PPO: mean_action_own)": ("pretanh_own", "mean_action_own"),
            "pretanh_demo (mean_action_demo)": ("pretanh_demo", "mean_action_demo"),
            "mask_fraction": ("mask_fraction",), "bc_relative_error": ("bc_relative_error",),
            "Q_max (PPO: V_max)": ("Q_max", "V_max")}  # fmt: skip
@@ -328,7 +349,8 @@ def watched_lines(runs):
             unit = 100 if names == ("Success",) else 1
             at = [unit * pd.Series([mean_of_tenth(history[name], share) for history in histories for name in names
                                     if name in history], dtype=float).mean() for share in (0.1, 0.5, 1)]  # fmt: skip
-            cells.append(", ".join("-" if x != x else f"{x:.2g}" if x < 99.5 else f"{x:.0f}" for x in at))
+            shown = ["-" if x != x else f"{x:.2g}" if x < 99.5 else f"{x:.0f}" for x in at]
+            cells.append(", ".join(shown) if set(shown) != {"-"} else "-")
         lines += [[TITLES[task], f"{algo.upper()}, {recipe}", *cells]] * bool(cells)
     return lines
 
@@ -337,6 +359,20 @@ def mean_of_tenth(values, share):
     """Mean over the tenth of a column of progress.csv that ends at this share of it."""
     end = math.ceil(share * len(values))
     return values.iloc[max(0, end - math.ceil(len(values) / 10)) : end].mean()
+
+
+def parts_lines(runs):
+    """The ablations at a glance: by flag, task and algorithm the differences in success and in a trial's steps."""
+    found, heads = {}, []
+    for task in PRINTED:
+        for line in tables.compared_lines("ablations", tables.of_task(runs, task, variants=True))[1:]:
+            algo, recipe, _ = line[0].split()
+            part, head = re.sub(r" \S+k steps$", "", line[2]), f"{TITLES[task]}, {algo.upper()}"
+            if recipe == "robust" and part != "the recipe's":
+                heads += [head] * (head not in heads)
+                found.setdefault(part, {})[head] = f"{line[7]}; {line[9]}"
+    return [["instead of the recipe's", *heads], *([part, *(cells.get(head, "-") for head in heads)]
+                                                   for part, cells in sorted(found.items()))]  # fmt: skip
 
 
 def study(run, printed):
@@ -387,8 +423,8 @@ def table_lines(kind, task, runs):
 
 BLOCKS = {f"{kind}-{task}": partial(table_lines, kind, task) for kind in (*METRICS, *COMPARED) for task in PRINTED}
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
-    ("results", results_lines), ("findings", findings_lines), ("watched", watched_lines), ("cost", cost_lines),
-    ("demonstrator", pid_lines))}  # fmt: skip
+    ("results", results_lines), ("verdicts", verdicts_lines), ("findings", findings_lines), ("watched", watched_lines),
+    ("parts", parts_lines), ("cost", cost_lines), ("demonstrator", pid_lines))}  # fmt: skip
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ import os
 import re
 import zipfile
 import zlib
+from collections import Counter
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import combinations
@@ -412,10 +413,12 @@ def table_lines(kind, rows):
 
 def table_notes(kind, rows):
     """What stands below the table, as lines."""
-    notes = ["Ours: the mean over seeds and its 95 % interval by Student's t, [-] of seeds all alike; as published, at "
-             "the paper's horizon and start, * where the paper's lies outside it."]  # fmt: skip
+    notes = [
+        "Ours: the mean over seeds and its 95 % interval by Student's t; [-]: none, of a single seed or of seeds all "
+        "alike. *: the paper's number lies outside it (runs as published and the PID with the authors' gains)."
+    ]
     if kind == "training":
-        notes += ["A single seed has no interval. R10, R90: mean return of the first and the last tenth (rounded up) "
+        notes += ["R10, R90: mean return of the first and the last tenth (rounded up) "
                   "of the agent's own episodes; I_R: R90 - R10.",
                   "T50: the first episode at which the mean of the last 50 exceeds half of R90; N/A where R90 <= 0 or "
                   "none does. The paper's rule is another (DIFFERENCES 56)."]  # fmt: skip
@@ -430,30 +433,30 @@ def table_notes(kind, rows):
     for group, mixed in ours[ours.trials.str.contains(" ")].groupby(GROUP, sort=False).trials:
         trials = sorted(set(" ".join(mixed).split()), key=int)
         notes.append(f"Seeds of {group_label(group)} were tested in {' or '.join(trials)} trials.")
-    return [*notes, *undecided(kind, ours)]
+    return [*notes, *ranked(kind, ours)]
 
 
-def undecided(kind, rows):
-    """Lines: the pairs of columns, of one sweep or with the baseline, that the paper ranks by the table's main metric
-    and that our seeds rank the other way, or cannot tell apart."""
-    metric, found = RANKED[kind], {"rank the other way": {}, "cannot tell apart": {}, "agree on": {}, "too few": {}}
+def ranked(kind, rows):
+    """Lines: of the pairs of columns, of a sweep or with the baseline, that the paper ranks by the table's main metric,
+    how many our seeds rank alike, and those that they rank the other way."""
+    metric, verdicts, found = RANKED[kind], ("rank the other way", "cannot tell apart", "agree on"), {}
     for _, group in rows[(rows.metric == metric) & (rows.evaluation == "")].groupby(GROUP):
         for one, other in combinations(group.itertuples(), 2):
             compared = one.sweep == other.sweep or "baseline" in (one.sweep, other.sweep)
             if not (compared and abs(one.paper - other.paper) > 0):  # not where either is NaN
                 continue
             gap, low, high = difference(metric, one.values, other.values)
-            verdict = ("too few" if low != low else "cannot tell apart" if low <= 0 <= high else
-                       "agree on" if (gap > 0) == (one.paper > other.paper) else "rank the other way")  # fmt: skip
+            alike = (gap > 0) == (one.paper > other.paper)
             pair = " and ".join(f"N_demos={row.num_demos} lambda_BC={row.lambda_bc:g}" for row in (one, other))
             label = group_label([getattr(one, name) for name in GROUP])
-            found[verdict][f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
-                           f"{between(gap, low, high, METRICS[kind][metric])} ({label})"] = None  # fmt: skip
-    *known, few = found.values()
-    counts = ", ".join(f"{len(pairs)} we {verdict}" for verdict, pairs in zip(found, known, strict=False))
-    head = f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference: {counts}"
-    heads = [head + f"; {len(few)} of a single seed" * bool(few)] * any(found.values())
-    return [*heads, *found["rank the other way"], *found["cannot tell apart"]]
+            line = (f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
+                    f"{between(gap, low, high, METRICS[kind][metric])} ({label})")  # fmt: skip
+            found[line] = "" if low != low else verdicts[1] if low <= 0 <= high else verdicts[2 * alike]
+    counts = Counter(found.values())
+    heads = [f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference: "
+             + ", ".join(f"{counts[verdict]} we {verdict}" for verdict in verdicts)
+             + f"; {counts['']} of a single seed" * (counts[""] > 0)] * bool(found)  # fmt: skip
+    return [*heads, *(line for line, verdict in found.items() if verdict == verdicts[0])]
 
 
 def compared_lines(kind, runs):
@@ -509,7 +512,8 @@ def make_table(kind, task, runs, variants=False):
         notes = [
             f"Mean over seeds, difference from {base}; 95 % intervals by Student and Welch; [-]: no spread to see.",
             "†: all seeds on one side of all of the other's, by chance at most 1 time in 20 (two-sided permutation "
-            "test; 3 against 3 are too few for one). Own episodes: all of the training's, exploration included.",
+            "test; 3 against 3 are too few for one); near 0 or 100 % it says more than the interval.",
+            "Own episodes: all of the training's, exploration included.",
         ]
         if kind == "ablations":
             notes += [

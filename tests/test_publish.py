@@ -177,12 +177,36 @@ def test_an_agent_is_compared_with_the_pid_that_it_was_shown_of_which_the_succes
          "600 100.0)", "99.8 and 50.0", "49.8 [46.6, 52.9] points", "2", "*holds*"]]  # fmt: skip
 
 
+def test_at_a_glance_one_comparison_shows_its_number_and_several_are_counted(tmp_path):
+    for seed in (0, 1):
+        for symmetry, N, won in (("none", 5, seed), ("none", 20, 199 + seed), ("gas", 20, 199 + seed)):
+            folder = tmp_path / f"runs/{symmetry}{N}-{seed}"
+            write_run(folder, symmetry=symmetry, num_demos=N, success=of_200(won), seed=seed)
+        for N, won in ((10, seed), (40, seed)):
+            folder = tmp_path / f"runs/so2-{N}-{seed}"
+            write_run(folder, symmetry="so2", num_demos=N, success=of_200(won), seed=seed)
+    found = {line[0]: line[1:] for line in publish.verdicts_lines(tables.find_runs()[0])}
+    assert found["claim"] == ["P2P", "P2P-O", "P&P"]
+    assert found[publish.CLAIMS["mapping"]] == ["holds: 99.5 [98.0, 100.0] points", "-", "-"]
+    assert found[publish.CLAIMS["demos"]] == ["holds in 1 of 2; cannot be told apart in 1 of 2", "-", "-"]
+
+
 def test_what_went_on_inside_is_shown_after_a_tenth_half_and_all_of_a_run(tmp_path):
     run = write_run(tmp_path / "runs/a")
     rows = "".join(f"{i},{200 * i},0,{i},{i},nan\n" for i in range(1, 21))
     (run / "progress.csv").write_text("epoch,env_steps,demo_env_steps,seconds,Q_max,eval_success\n" + rows)
-    (line,) = [line for line in publish.watched_lines(tables.find_runs()[0]) if line[0] == "P2P"]
-    assert line[1] == "DDPG, robust" and line[6] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
+    line = dict(zip(*publish.watched_lines(tables.find_runs()[0]), strict=True))
+    assert line["agent"] == "DDPG, robust" and line["L_O"] == "-"
+    assert line["Q_max (PPO: V_max)"] == "1.5, 9.5, 20"  # means of rows 1 and 2, 9 and 10, 19 and 20
+
+
+def test_what_each_part_is_worth_is_what_the_tables_of_ablations_say(tmp_path):
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/a{seed}", seed=seed, success=of_200(199 + seed))
+        write_run(tmp_path / f"runs/b{seed}", seed=seed, success=of_200(seed), variant="n_step=1")
+    head, line = publish.parts_lines(tables.find_runs()[0])
+    assert head == ["instead of the recipe's", "P2P, DDPG"] and line[0] == "n_step=1"
+    assert line[1].startswith("-99.5 [-100.0, -98.0]; ")
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------

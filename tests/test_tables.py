@@ -154,14 +154,12 @@ def test_the_PID_stands_beside_the_papers_in_the_test_and_not_in_training(tmp_pa
     assert "pid" not in tables.make_table("training", "p2p", tables.find_runs()[0])[0]
 
 
-def test_pairs_that_the_paper_ranks_are_listed_where_the_difference_may_be_0(tmp_path):
+def test_pairs_that_the_paper_ranks_are_counted_by_what_our_seeds_say_of_them(tmp_path):
     for lam, *values in ((0.1, 0, 4), (0.6, 1, 5), (1.8, 80, 81)):
         for seed, value in enumerate(values):
             write_run(tmp_path / f"runs/{lam}-{seed}", [value] * 60, lambda_bc=lam, seed=seed)
     write_run(tmp_path / "runs/one", [0.0] * 60, num_demos=0, lambda_bc=0)
     text = tables.make_table("training", "p2p", tables.find_runs()[0])[0]
-    (line,) = [line for line in text.splitlines() if ", our difference" in line]
-    assert "lambda_BC=0.1 and N_demos=100 lambda_BC=0.6: the paper's 3.72 and 6.83, our difference -1.00 [" in line
     assert "0 we rank the other way, 1 we cannot tell apart, 2 we agree on; 3 of a single seed" in text
 
 
