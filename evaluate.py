@@ -21,12 +21,14 @@ folder, where training writes.
 
 import contextlib
 import csv
+import fcntl
 import gzip
 import io
 import json
 import math
 import os
 import sys
+import zlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -47,7 +49,7 @@ from logx import flag
 HERE = Path(__file__).resolve().parent
 RESULTS, RUNS = HERE / "data/results", (HERE / "data/runs", Path("data/runs"))  # where runs are looked for
 FIRST_SEED = 1_000_000  # trial i resets with seed FIRST_SEED + i: far from the seeds that runs usually train with
-VALIDATION = 10_000  # trials from here on are for choosing; 0 ... 499, and those from 50,000 on, choose nothing
+VALIDATION, UNSEEN = 10_000, 50_000  # trials between these are for choosing; 0 ... 499, and those after, choose nothing
 PATHS = 20  # trials whose TCP paths are kept
 COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm",
            "goal_theta", "goal_rho", "goal_z"]  # fmt: skip
@@ -63,7 +65,7 @@ class Flags:
     gains: str | None = flag(None, "with --pid; authors", choices=tuple(pid_demo.GAINS))
     out: Path | None = flag(None, "with --pid: the folder that its trials are written to", metavar="FOLDER")
     trials: int = flag(500, "how many", low=1)
-    first_trial: int = flag(0, f"number of the first; choose on trials from {VALIDATION} on", low=0)
+    first_trial: int = flag(0, f"number of the first; choose on {VALIDATION} to {UNSEEN - 1} only", low=0)
     start: tuple[float, float, float] | None = flag(None, "another start pose, in rad, m, m",
                                                     metavar=("THETA", "RHO", "Z"))  # fmt: skip
     horizon: int | None = flag(None, "steps until a timeout; the task's T", low=1)
@@ -102,6 +104,8 @@ class Policy:
                 layers += [torch.nn.Linear(n_in, n_out), torch.nn.ReLU()]
         net = torch.nn.Sequential(*layers[:-1])
         net.load_state_dict(stored["weights"], assign=True)
+        if not all(w.dtype == torch.float32 and w.isfinite().all() for w in net.parameters()):
+            raise ValueError("weights that are not finite, or not float32")
         self.net = torch.nn.Sequential(net, torch.nn.Tanh() if output == "tanh" else torch.nn.Identity())
 
     def __call__(self, obs):
@@ -313,7 +317,7 @@ def print_table(results, versus=None):
     def cells(found):
         texts = []
         for (_, d, width), (mean, low, high) in zip(CELLS.values(), found.values(), strict=True):
-            ends = f"[{low:.{d}f}, {high:.{d}f}]" if low == low else "[-]"  # a single trial has none
+            ends = f"[{low:.{d}f}, {high:.{d}f}]" if low < high else "[-]"  # none of a single trial, or of trials alike
             texts.append((f"{mean:.{d}f} {ends}" if mean == mean else "N/A").ljust(width))
         return "  " + " ".join(texts)
 
@@ -348,15 +352,28 @@ def trials_in(path):
     return len(path.read_text(errors="replace").splitlines()) - 1 if path.is_file() else 0
 
 
+def is_training(folder):
+    """Whether a process holds the run (logx.RunFolder)."""
+    try:
+        with open(folder / "lock") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # none, as of published runs
+        pass
+    return False
+
+
 def write(folder, rows, trajectories, what=""):
-    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too; a published or larger one stays. Raises
-    BadInput."""
+    """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too. A published or larger one stays; of a
+    run that still trains none is written, for its policy is not yet the one that it ends with. Raises BadInput."""
     path = path_of(folder, what)
     published = path.with_name(f"{path.name}.gz")
-    if published.exists() or trials_in(path) > len(rows):
-        print(f"{published}: published, stays as it is" if published.exists() else
-              f"{path}: of {trials_in(path)} trials, stays as it is")  # fmt: skip
-        return
+    for stays, message in ((published.exists(), f"{published}: published, stays as it is"),
+                           (trials_in(path) > len(rows), f"{path}: of {trials_in(path)} trials, stays as it is"),
+                           (is_training(folder), f"{folder}: still trains; these trials are not written")):  # fmt: skip
+        if stays:
+            return print(message)
     text = io.StringIO()
     table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     table.writeheader()
@@ -402,7 +419,7 @@ def print_agents():
         tested = "not tested"
         for name, read in (("evaluation.csv", open), ("evaluation.csv.gz", gzip.open)):
             with (
-                contextlib.suppress(OSError, EOFError, LookupError, ValueError),
+                contextlib.suppress(OSError, EOFError, LookupError, ValueError, zlib.error),
                 read(path.parent / name, "rt") as file,
             ):
                 if success := [row["success"] == "1" for row in csv.DictReader(file)]:
@@ -418,9 +435,17 @@ def print_agents():
 def check(flags):
     """{name: (task, source)} of what the flags name. Raises logx.BadInput."""
     film.check(flags.gif, flags.watch)
+    changed = {name for name, value in vars(flags).items() if value != getattr(Flags, name)}
+    for there, useless, where in (
+        (flags.list, changed - {"list"}, "--list"),
+        (flags.gif or flags.watch, {"trials", "jobs", "out"}, "--gif, --watch"),
+        (flags.show, {"first_trial"}, "--show"),
+    ):
+        for name in sorted(changed & useless) if there else ():
+            raise logx.BadInput(f"{'RUN' if name == 'runs' else '--' + name}: does not go with {where}")
     of_pid = flags.task or flags.gains or flags.out
     for wrong, message in (
-        (not (flags.pid or flags.runs), "RUN: name run folders (--list prints some), or --pid --task T"),
+        (not (flags.pid or flags.runs or flags.list), "RUN: name run folders (--list prints some), or --pid --task T"),
         (flags.pid and not flags.task, f"--pid: needs --task, one of {', '.join(TASKS)}"),
         (of_pid and not flags.pid, "--task, --gains, --out: go with --pid; a run has its own"),
         (flags.out and flags.out.exists() and not flags.out.is_dir(), f"--out {flags.out}: must be a folder"),
@@ -441,14 +466,6 @@ def check(flags):
     tasks = sorted({task for task, _ in agents.values()})
     if len(tasks) > 1 and (flags.versus or flags.gif):
         raise logx.BadInput(f"--versus, --gif: the agents must be of one task, not {' and '.join(tasks)}")
-    for task, source in agents.values():
-        folder = folder_of(source, flags)
-        if folder is None or flags.gif or flags.watch:
-            continue
-        path = path_of(folder, study(task, flags.first_trial, flags.start, flags.horizon))
-        if trials_in(path) > flags.trials:
-            raise logx.BadInput(f"--trials {flags.trials}: would replace the {trials_in(path)} of {path}; ask for as "
-                                "many, or move the file")  # fmt: skip
     if flags.out and (flags.out / "config.json").exists():
         asked = {"task": flags.task, "algo": "pid", "gains": flags.gains or "authors"}
         try:
@@ -471,9 +488,9 @@ def folder_of(source, flags):
 def main():
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # small networks: more threads would wait for each other
     flags = logx.parse_flags(Flags, __doc__)
+    agents, results = check(flags), {}
     if flags.list:
         return print_agents()
-    agents, results = check(flags), {}
     settings = dict(start=flags.start, horizon=flags.horizon)
     if flags.gif or flags.watch:
         numbers = flags.show or [flags.first_trial + i for i in range(3 if flags.watch else 6)]

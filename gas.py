@@ -21,8 +21,8 @@ import numpy as np
 
 from kinova_env import INDEX, OBS_DIM, OBSERVATION, TASKS, wrap
 
-# By observation width, 22 or 25: where the entries begin that rotate in each way; and one of its tasks, which all have
-# the same layout and sectors.
+# By observation width, 22 or 25: where each part begins, by how it rotates; and the name of one task of that width: all
+# of them share layout and sectors.
 _ROTATES, _TASK = {}, {}
 for _task, _layout in OBSERVATION.items():
     _first = _TASK.setdefault(OBS_DIM[_task], _task)
@@ -137,7 +137,7 @@ def seen(obs, symmetry):
     return _VIEWS[symmetry](obs)
 
 
-# What one also does with a batch, as so2 and mirror do, is in ReplayBuffer.sample (DDPG) and Learner.demo_batch (PPO).
+# so2 and mirror also change each batch: ReplayBuffer.sample (DDPG), TrajectoryBuffer.columns, Learner.demo_batch (PPO).
 _VIEWS = dict.fromkeys(("none", "gas", "so2"), lambda obs: obs)
 _VIEWS |= {"canonical": canonical, "cylinder": cylinder, "mirror": cylinder}
 SYMMETRIES = tuple(_VIEWS)  # of --symmetry; whatever maps demonstrations also asks for "gas" by name

@@ -11,6 +11,7 @@ The class docstring of `KinovaEnv` says what goes in and what comes out. Importi
 import contextlib
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 
 import gymnasium
@@ -34,9 +35,10 @@ class Task:
     test_theta: float  # start angle of the test study
 
 
-# A new one also needs a row in OBSERVATION (P_g and e first among vectors; BOUND), what is its own in _draw, step and
-# PID.act, TASK_DEFAULTS (for --recipe robust ROBUST_TASK too) in the algorithm files, and TITLES in tables.py; tests
-# are then of it too. sweep.py runs the paper's. --symmetry mirror, which is robust's, needs a task that has this one.
+# To add a task: a row here and in OBSERVATION (P_g, then e, first among vectors; new names in BOUND); its own rules in
+# _draw, step and PID.act; TASK_DEFAULTS, for --recipe robust ROBUST_TASK too, in both algorithm files; TITLES in
+# tables.py; tests are then of it too. Tasks of one observation width share layout and sector_offset (gas.py).
+# --symmetry mirror, robust's, holds only where left and right are alike. sweep.py runs the paper's tasks alone.
 TASKS = {
     "p2p": Task("KinovaP2P-v0", 400, 0.5, "", -0.5, -math.pi / 4),
     "p2po": Task("KinovaP2PO-v0", 500, 1.0, "obstacle", 0.0, -math.pi / 2),
@@ -153,6 +155,8 @@ def start_posture(theta, rho, z):
 
     Raises ValueError where the arm cannot be so.
     """
+    if rho < 0:
+        raise ValueError(f"start {(theta, rho, z)}: rho must be at least 0")
     found = postures(cartesian(theta, rho, z), 0.0)
     if not len(found):
         raise ValueError(f"start {(theta, rho, z)}: no posture puts a horizontal tool there")
@@ -225,11 +229,12 @@ class KinovaEnv(gymnasium.Env):
     | demo | the start of sector k of K, 0.52, 0.42, each joint +- 0.02 rad | in the sector, [0.4, 0.6), [0.35, 0.55) |
 
     The cube lies at theta_goal +- [pi/12, pi/6), rho in [0.4, 0.6), z within 0.1 of the goal's. On stage "demo" the
-    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. A P&P cube at whose
-    centre the TCP cannot be with the hand so level (a twelfth of all; some 70 % of these could be grasped from beside),
-    or that lies outside its sector, is drawn again alone, so that goals stay uniform. A draw that starts in collision
-    or at the goal is drawn again whole. So is a P&P goal for which 50 cubes will not do: none of 20,000 goals on each
-    stage, some where sectors are narrow (K > 10); with an explicit goal that is a ValueError.
+    goals of tasks with a cube lie in the sector's clockwise half, and P&P cubes in the sector. Two things are drawn
+    again. A P&P cube on which the hand, tilted by at most 0.3 rad, cannot be centred (a twelfth of all; some 70 % of
+    these could be grasped from beside), or that lies outside its sector: the cube alone, so that goals stay uniform.
+    The whole draw, where it starts in collision or at the goal, or where 50 cubes in a row did not do for a P&P goal:
+    never in 20,000 goals of each stage, at times where sectors are narrow (K > 10); for an explicit goal that is a
+    ValueError.
 
     ## Episode end
     Terminated: success (norm(e) < 0.05, on P&P with the cube grasped), or collision: `info["collision"]` is "self" for
@@ -243,16 +248,16 @@ class KinovaEnv(gymnasium.Env):
     `info` holds `is_success`, `collision`, `grasped`, `distance` (m), `effort` (norm of tau_hat) and `reward_terms`.
     """
 
-    # "human" where there is a screen
-    metadata = {"render_modes": ["human"] * film.has_display() + ["rgb_array"], "render_fps": 50}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}
 
     def __init__(self, task="p2p", stage="train", partitions=4, render_mode=None, width=640, height=480):
         if task not in TASKS:
             raise ValueError(f"task {task!r}: must be one of {', '.join(TASKS)}")
         if stage not in STAGES:
             raise ValueError(f"stage {stage!r}: must be one of {', '.join(STAGES)}")
-        if not isinstance(partitions, int) or partitions < 1:
-            raise ValueError(f"partitions {partitions!r}: must be a whole number of at least 1")
+        for name, value in (("partitions", partitions), ("width", width), ("height", height)):
+            if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} {value!r}: must be a whole number of at least 1")
         if render_mode not in (None, "human", "rgb_array"):
             raise ValueError(f"render_mode {render_mode!r}: must be None, 'human' or 'rgb_array'")
         if render_mode == "human" and not film.has_display():
@@ -354,7 +359,7 @@ class KinovaEnv(gymnasium.Env):
     def _check_options(self, options):
         unknown = set(options) - {"partition", "start", "goal", "object"}
         if unknown:
-            raise ValueError(f"options {sorted(unknown)}: allowed are partition, start, goal, object")
+            raise ValueError(f"options {sorted(map(str, unknown))}: allowed are partition, start, goal, object")
         if "partition" in options:
             if self.stage != "demo":
                 raise ValueError(f"partition: only stage 'demo' has partitions, this is stage {self.stage!r}")
@@ -371,6 +376,7 @@ class KinovaEnv(gymnasium.Env):
                 place = np.empty(0)
             if place.shape != (3,) or not np.all(np.isfinite(place)) or place[1] < 0:
                 raise ValueError(f"{name} {options[name]!r}: must be three finite numbers (theta, rho >= 0, z)")
+            place = place.tolist()
             if name == "start":
                 start_posture(*place)
             elif name == "object" and self.row.cube == "object":
@@ -485,7 +491,7 @@ class KinovaEnv(gymnasium.Env):
 
     def _observe(self, e):
         q1, q2, q3, q5 = self.q
-        q1 = (q1 + math.pi) % (2 * math.pi) - math.pi
+        q1 = wrap(q1)
         sin, cos = math.sin, math.cos
         state = [q1, q2, q3, q5, sin(q1), sin(q2), sin(q3), sin(q5), cos(q1), cos(q2), cos(q3), cos(q5)]
         state += self.q_dot

@@ -10,7 +10,7 @@
 The controller drives joint angles to the inverse kinematics of Cartesian set
 points; the action is the reference joint velocity in the environment's
 normalised units. Gains: `authors` are those of the authors' code (280 steps a
-demonstration of P2P); with `fast` it takes some 110.
+demonstration of P2P); with `fast` it takes some 120.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ import logx
 from kinova_env import EPSILON, INDEX, OBS_DIM, STAGES, TASKS, TIME_STEP, grasp_postures, postures, wrap
 from logx import flag
 
-# m: how far the arm's links keep from P2P-O's cube; how far before P&P's cube the approach begins, at most
+# m. obstacle: what the links keep from P2P-O's cube. object: how far before P&P's cube the approach begins, at most
 CLEARANCE = {"obstacle": 0.13, "object": 0.15}
 ABOVE = 0.18  # m, of P2P-O's cube at which the TCP crosses it
 ASIDE = 0.19  # m, from P2P-O's cube to which the arm turns away before it rises
@@ -98,12 +98,13 @@ class PID:
         azimuth, of_goal, of_cube = (math.atan2(place[1], place[0]) for place in places)
         turn, beside = wrap(of_goal - azimuth), wrap(of_cube - azimuth)
 
-        # near the goal, and no longer over the cube: from 0.55 to 0.8 of the way from it to the goal, or to 0.16 m
-        descend = np.clip(min(2 - to_goal / BLEND, (to_cube / min(apart, 0.16) - 0.55) / 0.25), 0, 1)
+        # 0: stay up, 1: be down. Grows as the TCP comes from 0.2 to 0.1 m of the goal, and gets from 0.55 d to 0.8 d
+        # away from the cube; d: from the cube to the goal, 0.16 m at most
+        descend = np.clip(min(2 - to_goal / BLEND, (to_cube / np.clip(apart, 1e-6, 0.16) - 0.55) / 0.25), 0, 1)
         height = z_g + max(0, z_o + ABOVE - z_g) * (1 - descend)
         found = postures((x_g, y_g, height))
         passes = 0 < beside * np.sign(turn) < abs(turn)
-        nearest = 0 if passes else min(abs(beside), abs(wrap(beside - turn)))  # that the turn brings it to the cube
+        nearest = 0 if passes else min(abs(beside), abs(wrap(beside - turn)))  # the arm's least angle to it on the turn
         cross = self._clearest(found if len(found) else postures(self.env.goal), nearest)
 
         close = np.clip((ASIDE - 0.01 - to_cube) / 0.05, 0, 1)  # 1: turns away only; 0: rises only
@@ -269,10 +270,11 @@ def read_minari(path):
     dataset = minari.load_dataset(path.removeprefix(MINARI))
     tasks = {row.env_id: task for task, row in TASKS.items()}
     meta = {"task": tasks[dataset.env_spec.id], "env_steps": int(dataset.total_steps), "partitions": 4}
-    meta |= {"symmetry": "none"} | json.loads(dataset.storage.metadata.get("demonstrations", "{}"))
+    about, infos = dataset.storage.metadata.get("demonstrations"), {}
+    meta |= {"symmetry": "none"} | json.loads(about or "{}")
     demos = {name: [] for name in ROWS | EPISODES}
     for n, found in enumerate(dataset.iterate_episodes()):
-        infos, length = found.infos or {}, len(found.rewards)
+        infos, length = found.infos if about else {}, len(found.rewards)  # others' are the environment's, a step each
         rows = (found.observations[:-1], infos.get("asked", found.actions), found.rewards, found.observations[1:],
                 found.terminations, found.truncations, np.full(length, n), found.actions)  # fmt: skip
         of_episode = {"partition": gas.partition_of(found.observations[0], meta["partitions"]), "effort": np.nan}
@@ -317,7 +319,7 @@ def given(path, task, symmetry, partitions):
         demos, meta = load_demos(path, task)
     except ValueError as error:
         raise logx.BadInput(f"--demos {error}") from None
-    if "gas" in (symmetry, meta["symmetry"]) and meta["partitions"] != partitions:
+    if meta["partitions"] != partitions:
         raise logx.BadInput(f"--demos {path}: of {meta['partitions']} partitions, not --partitions {partitions}")
     if symmetry == "gas" and meta["symmetry"] != "gas":
         demos = gas.aggregate(demos, partitions)
@@ -329,7 +331,7 @@ def given(path, task, symmetry, partitions):
 
 
 def all_of(flags, recipe):
-    """How many episodes --demos gives under --symmetry, or the recipe's. Raises BadInput."""
+    """How many episodes --demos gives under flags.symmetry, where that is None the recipe's. Raises BadInput."""
     demos, _ = given(flags.demos, flags.task, flags.symmetry or recipe["symmetry"], flags.partitions)
     return len(demos["length"])
 
@@ -401,8 +403,15 @@ class Flags:
     K_P: float | None = flag(None, "instead of that of --gains", low=0)
     K_D: float | None = flag(None, "instead of that of --gains", low=0)
     K_I: float | None = flag(None, "instead of that of --gains", low=0)
-    clearance: float | None = flag(None, "of the cube, in m; p2po {obstacle}, pnp {object}".format(**CLEARANCE), low=0,
-                                   high=0.5, metavar="M")  # fmt: skip
+    clearance: float | None = flag(
+        None,
+        "from the cube, in m: p2po, of the links ({obstacle}); pnp, of where the approach begins ({object})".format(
+            **CLEARANCE
+        ),
+        low=0,
+        high=0.5,
+        metavar="M",
+    )
     noise: float = flag(0.0, "standard deviation of noise on the actions of --record, --trials", low=0, high=10)
     stage: str = flag("demo", choices=STAGES)
     symmetry: str = flag("none", "gas: record one partition, map it to the others", choices=("none", "gas"))
@@ -491,6 +500,8 @@ def main():
         if flags.watch or flags.gif:
             return show(flags, gains)
         demos, steps = record(flags.task, flags.record or flags.trials, **settings, stage=flags.stage, quiet=False)
+    except logx.BadInput:
+        raise
     except ValueError as error:  # sectors too narrow
         raise logx.BadInput(f"--{error}") from None
     meta = dict(task=flags.task, stage=flags.stage, env_steps=steps, **settings)

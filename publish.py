@@ -176,7 +176,7 @@ WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "error": ("E_95_cm", -1, "cm 
             "quick": ("steps", -1, "steps fewer")}  # {claim: (metric of evaluate.paired, sign, unit)}  # fmt: skip
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
-UNSEEN = "first trial 50000"  # the test study of 500 trials that today's DDPG agents had not met; earlier PPO ones had
+UNSEEN = f"first trial {evaluate.UNSEEN}"  # 500 trials that were seen of PPO alone while the recipes came about
 
 
 def comparisons(task, runs):

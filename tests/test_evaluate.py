@@ -1,6 +1,7 @@
 """evaluate.py: trials by hand on a scripted environment, the same for every agent; metrics, intervals, policies."""
 
 import csv
+import fcntl
 import json
 import math
 import os
@@ -432,10 +433,27 @@ def test_other_settings_are_written_to_a_file_of_their_own(run_folder, main, wor
 
 
 def test_a_study_of_more_trials_is_not_replaced_by_one_of_fewer(run_folder, main, capsys):
-    for trials, code in ((2, 0), (1, 2), (3, 0)):
-        assert main(run_folder, "--trials", trials) == code
-    assert "--trials 1: would replace the 2 of" in capsys.readouterr().err
+    for trials in (2, 1, 3):
+        assert main(run_folder, "--trials", trials) == 0
+    assert "evaluation.csv: of 2 trials, stays as it is" in capsys.readouterr().out
     assert (run_folder / "evaluation.csv").read_text().count("\n") == 4
+
+
+@pytest.mark.parametrize("words, says", [
+    (["--pid", "--task", "p2p", "--gif", "a.gif", "--trials", 20], "--trials: does not go with --gif, --watch"),
+    (["--list", "--task", "p2p"], "--task: does not go with --list"),
+    (["--pid", "--task", "p2p", "--start", 0, -0.5, 0.45], "--start (0.0, -0.5, 0.45): rho must be at least 0"),
+])  # fmt: skip
+def test_a_flag_that_would_do_nothing_is_refused(main, capsys, words, says):
+    assert main(*words) == 2 and says in capsys.readouterr().err
+
+
+def test_trials_of_a_run_that_still_trains_are_printed_and_not_written(run_folder, main, capsys):
+    with open(run_folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(run_folder, "--trials", 1) == 0 and "still trains" in capsys.readouterr().out
+    assert not (run_folder / "evaluation.csv").exists()
+    assert main(run_folder, "--trials", 1) == 0 and (run_folder / "evaluation.csv").exists()
 
 
 def test_a_published_study_stays_as_it_is_and_another_one_is_written_beside_it(run_folder, main, capsys):

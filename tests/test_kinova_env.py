@@ -289,7 +289,7 @@ def test_gymnasiums_checker_finds_nothing_to_warn_of(task):
         warnings.simplefilter("error")
         for settings in ({}, {"render_mode": "rgb_array", "width": 32, "height": 24}, {"stage": "demo"}):
             env = gymnasium.make(TASKS[task].env_id, **settings)
-            check_env(env.unwrapped)
+            check_env(env.unwrapped, skip_render_check=True)  # which opens a window
             env.reset(seed=0)
             env.step(env.action_space.sample())
             env.close()
