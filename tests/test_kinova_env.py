@@ -63,7 +63,8 @@ def assert_same_bits(rows, others):
 
 
 def test_wrong_argument_is_a_value_error_that_names_it():
-    for name, value in (("task", "reach"), ("stage", "Train"), ("partitions", 2.5), ("render_mode", "ansi")):
+    wrong = {"task": "reach", "stage": "Train", "partitions": 2.5, "width": -5, "height": True, "render_mode": "ansi"}
+    for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name} {value!r}: must be"):
             KinovaEnv(**{name: value})
 
