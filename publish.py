@@ -164,7 +164,7 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "plain": "Demo-EASE beats the plain algorithm",
     "mask": "The mask matters",
     "mapping": "Demonstrations of one partition, mapped to all, are better than as many of all",
-    "symmetry": "Symmetric demonstrations cost less",
+    "symmetry": "Symmetric demonstrations cost less: mapped ones are as good as recorded ones, within 5 points",
     "PID": "The agent beats its demonstrator",
     "error": "The agent ends nearer to the goal than its demonstrator",
     "return": "The agent's return is larger than its demonstrator's",
