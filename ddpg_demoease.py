@@ -6,8 +6,8 @@
     python ddpg_demoease.py --seed 1 --resume               # where it stopped
 
 `--recipe paper`, the default, is the algorithm as published (Table 1); `robust`
-adds parts, each a flag of its own. What they reach, in how many minutes:
-data/results/README.md. Differences from the paper: DIFFERENCES.md.
+changes settings and adds parts, each a flag. What they reach, in how many
+minutes: data/results/README.md. Differences from the paper: DIFFERENCES.md.
 """
 
 import math
@@ -38,7 +38,8 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0)
+    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0,
+                                 high=1_000_000)  # fmt: skip
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1, high=100)
@@ -54,25 +55,27 @@ class Flags(logx.RunFlags):
     start_steps: int | None = flag(None, "uniformly random actions first; 2 T, robust: 0", low=0)
     update_after: int | None = flag(None, "no updates before; T", low=0)
     replay_size: int = flag(1_000_000, "N_o", low=1, high=10_000_000)
-    batch_size: int = flag(100, "of B_o", low=1)
-    demo_batch_size: int = flag(100, "of B_d", low=1)
+    batch_size: int = flag(100, "transitions of B_o in an update", low=1)
+    demo_batch_size: int = flag(100, "transitions of B_d in an update", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
-    act_noise: float | None = flag(None, "sigma of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0)
+    act_noise: float | None = flag(None, "sigma of the exploration noise; 0.1, robust: 0.2, on p2po 0.1", low=0,
+                                   high=10)  # fmt: skip
     polyak: float = flag(0.995, "omega, target update coefficient", low=0, high=1)
     pi_lr: float | None = flag(None, "alpha_mu; 1e-3, robust: 3e-4", low=0)
     q_lr: float = flag(1e-3, "alpha_nu, and of the actor while cloning first", low=0)
-    hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
+    hidden_sizes: tuple[int, ...] | None = flag(None, "of both networks; p2p 128 512 128, p2po 256 1024 256, pnp "
+                                                "512 512 256", low=1, high=10_000)  # fmt: skip
     mask: str = flag("q", "q: Eq. 8; none: M = 1", ("q", "none"))
     demos_in_B_o: bool = flag(True, "demonstrations go into B_o too (Sec. 3.3; Alg. 1 prints an empty B_o)")
     timeout_ends: bool = flag(False, "a timeout ends bootstrapping too (zeta as Sec. 3.2 prints it)")
     # the parts of the robust recipe (ours)
-    demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
-    noise_kept: float | None = flag(None, "of exploration noise, 20 ms later; 0, robust: 0.9", low=0, high=1)
+    demo_noise: float | None = flag(None, "of demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0, high=10)
+    noise_kept: float | None = flag(None, "of the noise, in the next step's; 0, robust: 0.9", low=0, high=1)
     n_step: int | None = flag(None, "rewards before the bootstrapped value in a target; 1, robust: 10", low=1)
     clone_iters: int | None = flag(None, "updates of the actor on B_d before the first step; 0, robust: 10000", low=0)
     keep_clone: float | None = flag(None, "weight of staying near that clone in states of B_o; 0, robust: 10", low=0)
     updates_per_step: float | None = flag(None, "gradient steps an environment step; 1, robust: 0.25", low=1e-6)
-    normalize_obs: bool | None = flag(None, "observations less mean, over deviation, of B_d; robust: on pnp")
+    normalize_obs: bool | None = flag(None, "states less the mean of B_d's, over their deviation; robust: on pnp")
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
@@ -83,9 +86,8 @@ TASK_DEFAULTS = {  # Table 1, Sec. 4.2; N_demos, lambda: best columns of Tables 
 }
 PAPER = dict(symmetry="gas", gains="authors", act_noise=0.1, pi_lr=1e-3, demo_noise=0.0, noise_kept=0.0, n_step=1,
              clone_iters=0, keep_clone=0.0, updates_per_step=1.0, normalize_obs=False, grasp_input=False)  # fmt: skip
-ROBUST = dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_noise=0.2, noise_kept=0.9, n_step=10,
-              clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0, normalize_obs=False,
-              grasp_input=False)  # fmt: skip
+ROBUST = PAPER | dict(symmetry="mirror", gains="fast", act_noise=0.2, pi_lr=3e-4, demo_noise=0.2, noise_kept=0.9,
+                      n_step=10, clone_iters=10_000, keep_clone=10.0, updates_per_step=0.25, start_steps=0)  # fmt: skip
 ROBUST_TASK = dict(p2p=dict(epochs=25, steps_per_epoch=1000), p2po=dict(epochs=40, act_noise=0.1),
                    pnp=dict(epochs=25, normalize_obs=True, grasp_input=True))  # fmt: skip
 
@@ -122,9 +124,8 @@ def resolve(flags):
 class ReplayBuffer:
     """Transitions (s, a, r, s', discount) in a ring; the value of s' counts for discount = gamma^n (1 - zeta).
 
-    Here a symmetry meets the data (but `gas`, which has mapped the demonstrations before): `gas.seen` turns each state
-    as it is stored; of a sample, `so2` turns each row by a random angle, `mirror` exchanges left and right in every
-    other.
+    States are stored as `gas.seen` shows them. Of a sample, `so2` turns each row by a random angle, and `mirror`
+    reflects every other row. `gas` does nothing here: its demonstrations were mapped before.
     """
 
     def __init__(self, obs_dim, size, symmetry):
@@ -337,7 +338,7 @@ class Learner:
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, f.clone_iters))
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
             if stop_signals:
-                raise KeyboardInterrupt("stopped while cloning; --resume begins it anew")
+                raise KeyboardInterrupt(f"{f.name}: stopped while cloning; --resume begins it anew")
             s, a, *_ = B_d.sample(f.demo_batch_size, f.device)
             L_BC = loss_BC(a, net.pi(s), torch.ones_like(a[:, 0]))
             optimizer.zero_grad()

@@ -28,6 +28,7 @@ import json
 import math
 import os
 import sys
+import time
 import zlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -364,14 +365,16 @@ def is_training(folder):
     return False
 
 
-def write(folder, rows, trajectories, what=""):
+def write(folder, rows, trajectories, what="", began=math.inf):
     """A study's table in `folder`, of the one of Sec. 5.2 trajectories.npz too. A published or larger one stays; of a
-    run that still trains none is written, for its policy is not yet the one that it ends with. Raises BadInput."""
-    path = path_of(folder, what)
+    run that trains, or has since they `began` (time.time()), none is written: its policy is or was not the one that it
+    ends with. Raises BadInput."""
+    path, policy = path_of(folder, what), folder / "policy.pt"
     published = path.with_name(f"{path.name}.gz")
     for stays, message in ((published.exists(), f"{published}: published, stays as it is"),
                            (trials_in(path) > len(rows), f"{path}: of {trials_in(path)} trials, stays as it is"),
-                           (is_training(folder), f"{folder}: still trains; these trials are not written")):  # fmt: skip
+                           (is_training(folder) or policy.exists() and policy.stat().st_mtime > began,
+                            f"{folder}: still trains; these trials are not written")):  # fmt: skip
         if stays:
             return print(message)
     text = io.StringIO()
@@ -496,6 +499,7 @@ def main():
         numbers = flags.show or [flags.first_trial + i for i in range(3 if flags.watch else 6)]
         return show(agents, numbers, flags.gif, **settings)
     for name, (task, source) in agents.items():
+        began = time.time()
         found = run_trials(task, source, flags.trials, flags.first_trial, jobs=flags.jobs, **settings)
         folder = folder_of(source, flags)
         if flags.out and source in pid_demo.GAINS and not (folder / "evaluation.csv.gz").exists():
@@ -505,7 +509,7 @@ def main():
                 logx.atomic_write(folder / "config.json", json.dumps(config, indent=1))
         results[name] = found[0]
         if folder is not None:
-            write(folder, *found, study(task, flags.first_trial, **settings))
+            write(folder, *found, study(task, flags.first_trial, **settings), began)
     print_table(results, str(flags.versus) if flags.versus else None)
 
 

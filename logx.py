@@ -64,10 +64,8 @@ def run_script(main):
     try:
         code = main() or 0
         sys.stdout.flush()
-    except BadInput as error:
-        code, message = 2, f"error: {one_line(error)}"
-    except NotFinite as error:
-        code, message = 3, f"error: {one_line(error)}"
+    except (BadInput, NotFinite) as error:
+        code, message = 2 if isinstance(error, BadInput) else 3, f"error: {one_line(error)}"
     except KeyboardInterrupt as interrupt:
         code, message = 130, " ".join(map(str, interrupt.args)) or "interrupted"
     except BrokenPipeError:  # the reader of our output has seen enough
@@ -103,12 +101,12 @@ def path(text):
 class RunFlags:
     """The flags of every run, whatever the algorithm."""
 
-    name: str | None = flag(None, "of the run's folder; says task, algorithm, recipe, N, lambda, symmetry and seed")
+    name: str | None = flag(None, "of its folder; says task, algorithm, recipe, N, lambda, symmetry, variant, seed")
     data_dir: str = flag("data/runs", "where run folders lie, from the present folder")
     resume: bool | str = flag(False, "go on from the checkpoint, or with the run in FOLDER", metavar="FOLDER")
     device: str = flag("cpu", "where the networks learn", choices=("cpu", "cuda"))
     eval_every: int = flag(5, "epochs between validation trials; 0 never", low=0)
-    eval_trials: int = flag(50, "how many of them", low=1)
+    eval_trials: int = flag(50, "validation trials each time", low=1, high=40_000)
     checkpoint_every: int = flag(5, "epochs between checkpoints", low=1)
     quick: bool = flag(False, "the robust recipe, then test trials and a GIF of the agent")
     quiet: bool = flag(False, "no progress bar and table")
@@ -176,6 +174,8 @@ def check_flags(flags):
             if x is not None and choices and x not in choices:
                 raise BadInput(f"--{field.name} {x}: must be one of {', '.join(map(str, choices))}")
             if x is None or isinstance(x, (bool, str, Path)):
+                if isinstance(x, str) and (low is not None or high is not None):  # of a config.json
+                    raise BadInput(f"--{field.name} {x!r}: must be a number")
                 continue
             if not abs(x) < math.inf or (low is not None and x < low) or (high is not None and x > high):
                 bounds = [f"at {word} {bound}" for word, bound in (("least", low), ("most", high)) if bound is not None]
@@ -186,8 +186,8 @@ def check_flags(flags):
 
 BOARD = dict(eval="test", EpRet="train", EpLen="train", Success="train", L="loss", epoch="time", env="time",
              demo="time", seconds="time")  # TensorBoard's group of a column, by its first word  # fmt: skip
-FREE = {field.name for field in dataclasses.fields(RunFlags)} | {"epochs"}  # what a resumed run may have otherwise
-# With it what a table's column and a run's seed say: all else makes a variant.
+FREE = {field.name for field in dataclasses.fields(RunFlags)} | {"epochs"}  # a resumed run may differ in these
+# These stand elsewhere in names and tables; a difference in any other flag makes a variant.
 NOT_A_VARIANT = FREE | {"task", "recipe", "num_demos", "lambda_bc", "symmetry", "seed"}
 
 
@@ -321,7 +321,7 @@ class Replayable(gymnasium.Wrapper):
 
     def step(self, action):
         if not np.isfinite(action).all():
-            raise NotFinite("the actor gives NaN; begin anew with smaller learning rates")
+            raise NotFinite("an action is NaN or infinite; begin anew with smaller learning rates or less noise")
         s2, r, terminated, truncated, info = self.env.step(action)
         self.episode.append((self._s, action, r, s2, terminated, truncated))
         self._s = s2
@@ -375,9 +375,7 @@ class RunFolder:
                 raise BadInput(f"{name}: {folder} exists; go on with --resume, or choose another --name")
             if list(folder.glob("*.csv.gz")):
                 raise BadInput(f"{name}: {folder} is a published run, without the state to go on from; begin a new one")
-            lost = (folder / "policy.pt").exists() and not (folder / "checkpoint.pt").exists()
-            epochs = folder / "progress.csv"
-            if lost and not (epochs.exists() and epochs.read_text().count("\n") <= self.flags.checkpoint_every + 1):
+            if (folder / "policy.pt").exists() and not (folder / "checkpoint.pt").exists():
                 raise BadInput(f"{name}: {folder} has lost its checkpoint.pt; begin a new one")
             self._made = not folder.exists()
             folder.mkdir(parents=True, exist_ok=True)
@@ -398,6 +396,8 @@ class RunFolder:
                     path, size = folder / f"{table}.csv", self.checkpoint["log_bytes"][table]
                     if not path.exists() or path.stat().st_size < size:
                         raise BadInput(f"{path} is gone or shorter than its checkpoint says ({size} bytes)")
+                if "policy" in self.checkpoint:  # in case it was killed between the two
+                    self._store("policy.pt", self.checkpoint["policy"])
         except BadInput as error:
             self._lock.close()
             raise BadInput(f"--resume: {error}") from None
@@ -417,7 +417,7 @@ class RunFolder:
         path = self.folder / "config.json"
         try:
             self._recorded = json.loads(path.read_text())
-            self._recorded["versions"], self._recorded["epochs"]
+            self._recorded["versions"], int(self._recorded["epochs"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise BadInput(f"{path}: a run's settings as JSON are expected ({one_line(error)})") from None
 
@@ -434,12 +434,9 @@ class RunFolder:
     def __exit__(self, kind, error, trace):
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-        if self._bar:
-            self._bar.close()
-        for file in self._files.values():
-            file.close()
-        if self._board:
-            self._board.close()
+        for part in (self._bar, *self._files.values(), self._board):
+            if part is not None:
+                part.close()
         if not self._files and self._made and not self.checkpoint:  # stopped before anything was written
             with contextlib.suppress(OSError):
                 (self.folder / "lock").unlink()
@@ -482,9 +479,8 @@ class RunFolder:
             plain = {k: v if isinstance(v, (int, float, str)) else str(v) for k, v in self._config.items()}
             for part in hparams(plain, {"test/eval_success": 0, "train/EpRet": 0}):
                 self._board.file_writer.add_summary(part)
-        quiet = self.flags.quiet
         self._bar = tqdm(total=self.total_steps, initial=start, unit="step", smoothing=0.02, mininterval=1,
-                         disable=quiet or None)  # fmt: skip
+                         disable=self.flags.quiet or None)  # fmt: skip
         self._shown = ["eval_success", "epoch", "env_steps", "EpRet", "Success", "EpLen"]
         self._shown += [c for c in self.columns["progress"][len(PROGRESS) : -2] if c not in ("L_O", "L_C", "L_A")]
         self._say(f"{self.folder}: {self.total_steps:,} steps, {self._log['demo_env_steps']:,} of the demonstrator")
@@ -561,7 +557,7 @@ class RunFolder:
         self._write("progress", row)
         percent = {name: 100 * row[name] for name in ("eval_success", "Success") if name in row}
         cells = [(row | percent).get(c) for c in self._shown]
-        self._say(" ".join(f"{'–' if v is None else f'{v:.4g}' if isinstance(v, float) else v:>{max(7, len(c))}}"
+        self._say(" ".join(f"{'-' if v is None else f'{v:.4g}' if isinstance(v, float) else v:>{max(7, len(c))}}"
                            for c, v in zip(self._shown, cells, strict=True)))  # fmt: skip
         self._bar.update(env_steps - self._bar.n)
         for column, v in row.items() if self._board else ():
@@ -584,10 +580,8 @@ class RunFolder:
         return self._seconds + time.monotonic() - self._since
 
     def save(self, state, policy):
-        """Writes checkpoint.pt, `state` (tensors and plain types) and what a resume needs of the folder itself, and
-        policy.pt (see evaluate.Policy)."""
-        import torch
-
+        """Writes checkpoint.pt, `state` (tensors and plain types) and what a resume needs of the folder itself, then
+        policy.pt (see evaluate.Policy): one that is alone has lost its checkpoint."""
         with self._or_say_so():
             sizes = {}
             for table, file in self._files.items():
@@ -595,6 +589,12 @@ class RunFolder:
                 os.fsync(file.fileno())
                 sizes[table] = os.fstat(file.fileno()).st_size
             state = state | {"log_bytes": sizes, "log": json.dumps(self._log), "seconds": self.seconds(),
-                             "config": json.dumps(self._config), "format": FORMAT}  # fmt: skip
-            atomic_write(self.folder / "policy.pt", lambda file: torch.save(policy, file))
-            atomic_write(self.folder / "checkpoint.pt", lambda file: torch.save(state, file))  # last
+                             "config": json.dumps(self._config), "format": FORMAT, "policy": policy}  # fmt: skip
+        self._store("checkpoint.pt", state)
+        self._store("policy.pt", policy)
+
+    def _store(self, name, content):
+        import torch
+
+        with self._or_say_so():
+            atomic_write(self.folder / name, lambda file: torch.save(content, file))

@@ -180,7 +180,7 @@ def record(task, num_demos, gains="authors", seed=0, partitions=4, symmetry="non
     demos = {name: [] for name in ROWS | EPISODES}
     real = -(-num_demos // partitions) if symmetry == "gas" else num_demos
     env.reset(seed=seed)
-    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet):
+    for n in tqdm(range(real), desc="demonstrations", unit="episode", disable=quiet or None):
         s, info = env.reset(options={"partition": 0} if symmetry == "gas" else None)
         rewards, efforts, terminated, truncated = [], [], False, False
         drift = np.zeros(4)
@@ -360,8 +360,9 @@ def demonstrations(flags):
 def check_used(flags, defaults):
     """Raises BadInput where flags of an algorithm script that need demonstrations are other than its recipe's
     `defaults`, and there are none."""
-    for name in ("clone_iters", "keep_clone", "demo_noise", "normalize_obs"):
-        if flags.num_demos == 0 and getattr(flags, name, 0) not in (0, defaults.get(name)):
+    of_demos = "clone_iters keep_clone demo_noise normalize_obs mask demos_per_epoch"
+    for name in of_demos.split() if flags.num_demos == 0 else ():
+        if getattr(flags, name, 0) not in (0, defaults.get(name, getattr(type(flags), name, 0))):
             raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")
 
 

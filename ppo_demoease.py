@@ -39,7 +39,8 @@ class Flags(logx.RunFlags):
     # the experiment
     task: str = flag("pnp", "the task", choices=tuple(TASKS))
     recipe: str | None = flag(None, "paper: as published (the default); robust: with our parts", ("paper", "robust"))
-    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0)
+    num_demos: int | None = flag(None, "N_demos, in B_d; p2p 100, p2po 250, pnp 400, of --demos: all", low=0,
+                                 high=1_000_000)  # fmt: skip
     lambda_bc: float | None = flag(None, "lambda_BC (Eq. 6); p2p 1.8, p2po 2, pnp 15", low=0)
     symmetry: str | None = flag(None, "see gas.py; paper: gas, robust: mirror", gas.SYMMETRIES)
     partitions: int = flag(4, "K", low=1, high=100)
@@ -53,8 +54,8 @@ class Flags(logx.RunFlags):
     # the algorithm (Table 2; pi_lr, vf_lr, log_std: spinningup; demos_per_epoch: ours)
     demos_per_epoch: int | None = flag(None, "demonstrations that open an epoch; N_demos / 5, robust: N_demos", low=1)
     train_iters: int = flag(20, "N_up, updates an epoch at most", low=1)
-    batch_size: int = flag(800, "of B_o", low=1)
-    demo_batch_size: int = flag(100, "of B_d", low=1)
+    batch_size: int = flag(800, "transitions of B_o in an update", low=1)
+    demo_batch_size: int = flag(100, "transitions of B_d in an update", low=1)
     gamma: float = flag(0.99, "discount factor", low=0, high=1)
     lam: float = flag(0.97, "of the advantage estimates: lambda in Alg. 2, gamma^GAE in Table 2", low=0, high=1)
     clip_ratio: float = flag(0.2, "epsilon", low=0)
@@ -64,12 +65,13 @@ class Flags(logx.RunFlags):
     pi_lr: float | None = flag(None, "of the actor; 3e-4, robust: 3e-6", low=0)
     vf_lr: float = flag(1e-3, "of the critic, and of both networks while cloning first", low=0)
     log_std: float | None = flag(None, "log sigma to begin with; -0.5, robust: -2", low=-20, high=5)
-    hidden_sizes: tuple[int, ...] | None = flag(None, "128 512 128, 256 1024 256, 512 512 256", low=1, high=10_000)
+    hidden_sizes: tuple[int, ...] | None = flag(None, "of both networks; p2p 128 512 128, p2po 256 1024 256, pnp "
+                                                "512 512 256", low=1, high=10_000)  # fmt: skip
     mask: str = flag("reward", "reward: Eq. 9; none: M = 1", ("reward", "none"))
     demos_in_B_o: bool | None = flag(None, "demonstrations go into B_o too (Alg. 2); robust: no")
     # the parts of the robust recipe (ours)
-    demo_noise: float | None = flag(None, "noise on demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0)
-    clone_iters: int | None = flag(None, "updates on B_d alone before the first step; 0, robust: 10000", low=0)
+    demo_noise: float | None = flag(None, "of demonstrated actions (pid_demo.record); 0, robust: 0.2", low=0, high=10)
+    clone_iters: int | None = flag(None, "updates on the first epoch's B_d before any step; 0, robust: 10000", low=0)
     grasp_input: bool | None = flag(None, "one more input: whether the cube is grasped, P_o = P_e; robust: on pnp")
 
 
@@ -80,8 +82,8 @@ TASK_DEFAULTS = {  # Sec. 4.2; N_demos, lambda: best columns of Tables 3 to 5
 }
 PAPER = dict(symmetry="gas", gains="authors", pi_lr=3e-4, log_std=-0.5, demos_in_B_o=True, demo_noise=0.0,
              clone_iters=0, grasp_input=False)  # fmt: skip
-ROBUST = dict(symmetry="mirror", gains="fast", pi_lr=3e-6, log_std=-2.0, demos_in_B_o=False, demo_noise=0.2,
-              clone_iters=10_000, grasp_input=True)  # fmt: skip
+ROBUST = PAPER | dict(symmetry="mirror", gains="fast", pi_lr=3e-6, log_std=-2.0, demos_in_B_o=False, demo_noise=0.2,
+                      clone_iters=10_000, grasp_input=True)  # fmt: skip
 
 
 def recipe_defaults(task, recipe, num_demos=None):
@@ -278,8 +280,8 @@ class Learner:
         return i, *(x.to(self.flags.device) for x in (s, a, r))
 
     def clone(self, B_d, stop_signals=()):
-        """Before the first step: clone_iters updates on B_d alone, L_BC with M = 1 for the actor, L_C on the
-        demonstrated rewards-to-go for the critic, both at the critic's rate, which falls to 0 (a cosine)."""
+        """Before the first step: clone_iters updates on the first epoch's B_d, L_BC with M = 1 for the actor, L_C on
+        the demonstrated rewards-to-go for the critic, both at the critic's rate, which falls to 0 (a cosine)."""
         f, net = self.flags, self.net
         _, _, r, *_, end, _ = B_d.columns()
         R = discounted_sum(r, end, torch.zeros_like(end), f.gamma)  # no V yet: nothing follows a timeout
@@ -287,7 +289,7 @@ class Learner:
         decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, f.clone_iters)
         for _ in trange(f.clone_iters, desc="cloning", disable=f.quiet or None):
             if stop_signals:
-                raise KeyboardInterrupt("stopped while cloning; --resume begins it anew")
+                raise KeyboardInterrupt(f"{f.name}: stopped while cloning; --resume begins it anew")
             i, s, a, r = self.demo_batch(B_d)
             loss = loss_BC(a, net.mu(s), torch.ones_like(r)) + loss_C(net.V(s), R[i].to(f.device))
             optimizer.zero_grad()

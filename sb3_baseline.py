@@ -4,11 +4,11 @@
     python sb3_baseline.py --algo sac --task p2p
     python sb3_baseline.py --algo td3 --num_demos 100    # demonstrations too
 
-Its settings are Stable-Baselines3's own. With --num_demos the demonstrations
-of the robust recipe lie in the replay buffer from the start, and targets sum 10
-rewards, as ours do. The run's folder is like ours: evaluate.py measures and
-films the agent, and tables and figures show it beside ours. An interrupted run
-begins anew with --resume.
+Its settings are Stable-Baselines3's own, but for the noise of td3 and ddpg.
+With --num_demos the demonstrations of the robust recipe lie in the replay
+buffer from the start, and targets sum 10 rewards, as ours do. The run's folder
+is like ours: evaluate.py measures and films the agent, and tables and figures
+show it beside ours. An interrupted run begins anew with --resume.
 
 It is also an example of how the environment is used with another library.
 """
@@ -30,7 +30,7 @@ from logx import flag
 class Flags(logx.RunFlags):
     algo: str = flag("sac", "the algorithm", ("sac", "td3", "ddpg"))
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
-    num_demos: int = flag(0, "demonstrations in the replay buffer", low=0)
+    num_demos: int = flag(0, "demonstrations in the replay buffer", low=0, high=1_000_000)
     n_step: int | None = flag(None, "rewards in a target; 1, with demonstrations 10", low=1)
     seed: int = flag(0, "of all that is random", low=0, high=2**32 - 1)
     epochs: int = flag(100, "of 1000 steps", low=1)

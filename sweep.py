@@ -11,10 +11,11 @@ Columns are called as the paper's tables vary them: `lambda=1.8`, `demos=160`,
 `baseline`. `--vary` adds lists of values for any flag of the scripts, written
 as in the names of folders (`hidden_sizes=64x64,128x128`, `mask=q,none`).
 
-A run is one command of ddpg_demoease.py or ppo_demoease.py, and the folder that
-this command makes by itself; what it prints goes to log.txt there. The same
-sweep started again skips what is done or running, goes on with what was begun
-and starts what is missing, whatever killed it. Ctrl-C saves all runs and stops.
+A run is one command of ddpg_demoease.py or ppo_demoease.py, in the folder that
+this command makes by itself; its output goes to log.txt there. Started again,
+the same sweep skips runs that are done or running, goes on with those begun and
+starts the rest, whatever killed it. Ctrl-C saves all runs and stops; one that
+still records or clones begins anew.
 On Slurm each run is a job of one array (requirements-slurm.txt): before its
 time is up or when it is preempted it saves its state, is queued again, goes on.
 """
@@ -232,7 +233,7 @@ def costs(jobs):
         clone_iters = min(job.clone_iters, 200)
         short = ["--epochs", "2", "--eval_every", "0", "--num_demos", f"{demos}"]
         short += ["--clone_iters", f"{clone_iters}"] * bool(clone_iters)
-        short += "--steps_per_epoch 200 --start_steps 0 --update_after 0".split() if algo == "ddpg" else []
+        short += "--steps_per_epoch 200 --update_every 20 --start_steps 0 --update_after 0".split() * (algo == "ddpg")
         with tempfile.TemporaryDirectory() as folder:
             words = (*job.words, *short, "--data_dir", folder, "--name", "rate")
             job = replace(job, folder=Path(folder) / "rate", words=words)
@@ -305,7 +306,7 @@ class SlurmJob:
     def checkpoint(self):
         import submitit
 
-        with contextlib.suppress(ProcessLookupError, ChildProcessError):  # it has ended already
+        with contextlib.suppress(ProcessLookupError, ChildProcessError, AttributeError):  # ended, or not yet begun
             os.kill(self.process.pid, signal.SIGTERM)  # it saves its state
             os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # Popen.wait, interrupted by this, is locked
         return submitit.helpers.DelayedSubmission(SlurmJob(self.job))
@@ -323,6 +324,8 @@ def submit(jobs, flags):
                                    slurm_partition=flags.partition, slurm_array_parallelism=flags.jobs or 256,
                                    slurm_signal_delay_s=flags.signal_delay,
                                    slurm_additional_parameters={"requeue": True})  # fmt: skip
+        for job in jobs:
+            job.folder.mkdir(parents=True, exist_ok=True)
         with executor.batch():
             submitted = [executor.submit(SlurmJob(job)) for job in jobs]
     except ImportError:
@@ -330,9 +333,8 @@ def submit(jobs, flags):
     except (RuntimeError, submitit.core.utils.FailedJobError) as error:  # no Slurm here; or it refused
         raise logx.BadInput(f"--cluster slurm: {error}") from None
     except OSError as error:
-        raise logx.BadInput(f"--data_dir {flags.data_dir}: {error.strerror}; a folder is expected") from None
+        raise logx.BadInput(f"--data_dir: {error.filename}: {error.strerror}; a folder is expected") from None
     for job, its in zip(jobs, submitted, strict=True):
-        job.folder.mkdir(parents=True, exist_ok=True)
         (job.folder / "slurm_job").write_text(its.job_id)
         print(f"job {its.job_id}  {job.folder}")
 
@@ -345,7 +347,7 @@ def parse(argv=None):
     flags = logx.parse_flags(Flags, __doc__, argv)
     if flags.time * 60 < flags.signal_delay + 60:  # Slurm may signal a minute early: then there is no job to hear it
         raise logx.BadInput(f"--time {flags.time}: must be --signal_delay, {flags.signal_delay} s, and a minute more")
-    if flags.data_dir.exists() and not flags.data_dir.is_dir():
+    if os.path.exists(flags.data_dir) and not os.path.isdir(flags.data_dir):
         raise logx.BadInput(f"--data_dir {flags.data_dir}: is a file, a folder is expected")
     known = {name: None for task in flags.task for name in columns(task)}
     for name in flags.columns or ():
@@ -356,6 +358,8 @@ def parse(argv=None):
     for name in ("nice",) if flags.cluster else ("partition", "time", "mem_gb", "signal_delay"):
         if getattr(flags, name) != getattr(Flags, name):
             raise logx.BadInput(f"--{name}: goes with{'out' * bool(flags.cluster)} --cluster")
+    if flags.status and (flags.dry_run or flags.cluster):
+        raise logx.BadInput("--status: goes without --dry_run and --cluster")
     if flags.cluster:
         flags.data_dir = flags.data_dir.absolute()
     return flags
@@ -363,7 +367,7 @@ def parse(argv=None):
 
 def print_status(jobs, data_dir):
     """How far each run in data_dir is, of the grid or not, and how many of the grid's are not begun."""
-    begun, count = {job.folder: job for job in jobs if job.folder.exists()}, Counter()
+    begun, count = {job.folder: job for job in jobs if os.path.exists(job.folder)}, Counter()
     for folder in dict.fromkeys([*begun, *(file.parent for file in sorted(data_dir.glob("*/config.json")))]):
         try:
             config = {} if folder in begun else json.loads((folder / "config.json").read_text())

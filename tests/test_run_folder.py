@@ -141,7 +141,7 @@ def test_the_table_is_said_unless_quiet_and_standard_error_is_silent_where_it_is
     title, heads, row = out.splitlines()
     assert title == f"{run.folder}: 200 steps, 1,234 of the demonstrator"
     assert dict(zip(heads.replace(" %", "%").split(), row.split(), strict=True)) == {
-        "valid%": "–", "epoch": "1", "steps": "50", "EpRet": "-16.67", "train%": "100", "EpLen": "50"}  # fmt: skip
+        "valid%": "-", "epoch": "1", "steps": "50", "EpRet": "-16.67", "train%": "100", "EpLen": "50"}  # fmt: skip
 
 
 def test_a_resume_cuts_the_curves_back_to_the_checkpoint_and_goes_on_from_there(stopped):
@@ -196,15 +196,17 @@ def test_a_run_has_the_default_of_a_flag_that_is_newer_and_goes_on_with_no_other
 
 def test_a_run_that_has_lost_its_checkpoint_keeps_its_curves(stopped):
     (stopped / "checkpoint.pt").unlink()
-    with open(stopped / "progress.csv", "a") as file:
-        file.write("\n" * Flags().checkpoint_every)  # more epochs than can be without a checkpoint
     before = {path.name: path.read_bytes() for path in stopped.iterdir()}
     with pytest.raises(BadInput, match=f"{stopped} has lost its checkpoint.pt"):
         folder_of(stopped, resume=True)
     assert {path.name: path.read_bytes() for path in stopped.iterdir()} == before
-    (stopped / "progress.csv").unlink()
-    with pytest.raises(BadInput, match=f"{stopped} has lost its checkpoint.pt"):
-        folder_of(stopped, resume=True)
+
+
+def test_a_run_that_was_killed_between_its_checkpoint_and_its_policy_gets_the_policy_back(stopped):
+    before = (stopped / "policy.pt").read_bytes()
+    (stopped / "policy.pt").unlink()
+    with folder_of(stopped, resume=True):
+        assert (stopped / "policy.pt").read_bytes() == before
 
 
 def test_a_published_run_is_not_begun_again_in_its_place(tmp_path):
