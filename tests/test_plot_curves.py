@@ -32,7 +32,7 @@ def test_the_learning_figure_draws_the_papers_columns_of_one_group_with_the_base
         write_run(tmp_path / f"runs/{i}", [i + 1.0] * 60, num_demos=N, lambda_bc=lam)
     write_run(tmp_path / "runs/short", epochs=1)
     drawn = figure("learning")
-    both = ["DDPG (1 seed)", r"the paper's $\overline{R}_{90}$"]
+    both = ["DDPG (1 seed)", r"the paper's $\overline{R}_{90}$, in its line's colour"]
     first, second = (legend(ax) for ax in drawn.axes)
     assert first == [r"$\lambda_{BC}=0.1$ (1 seed)", *both] and second == [r"$N_{demos}=80$ (1 seed)", *both]
     dotted = [[line.get_ydata() for line in ax.lines if line.get_linestyle() == ":"] for ax in drawn.axes]
