@@ -196,6 +196,12 @@ def comparisons(task, runs):
             with_mask = (algo, recipe, symmetry, "", total)
             masked = at.get(with_mask, {}).get(key)
             yield "mask", f"{group_label(with_mask)}, and with mask=none", masked, found.get(key), 0
+        for (N, lam), curves in found.items() if (symmetry, variant) == ("gas", "") else ():
+            recorded, none = curves[0].row["recorded"], at.get((algo, recipe, "none", "", total), {})
+            mapped = f"{label}: {recorded} recorded in one partition and mapped to {N}"
+            yield ("mapping", f"{mapped}, and {recorded} recorded in all", curves, none.get((recorded, lam)), 0)
+            yield ("symmetry", f"{mapped}, and {N} recorded in all: at most {MARGIN} points worse", curves,
+                   none.get((N, lam)), MARGIN)  # fmt: skip
         own_length = all(curves.own_length for side in found.values() for curves in side)
         if variant not in ("", *(f"gains={name}" for name in pid_demo.GAINS)) or not (variant or own_length):
             continue  # a recipe of another length is there for the ablations
@@ -218,12 +224,6 @@ def comparisons(task, runs):
             yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low), 0
         plain = [curves for (N, _), part in found.items() if not N for curves in part]
         yield "plain", f"{label}: with demonstrations, and without", found.get(key), plain, 0
-        for (N, lam), curves in found.items() if symmetry == "gas" else ():
-            recorded, none = curves[0].row["recorded"], at.get((algo, recipe, "none", "", total), {})
-            mapped = f"{label}: {recorded} recorded in one partition and mapped to {N}"
-            yield ("mapping", f"{mapped}, and {recorded} recorded in all", curves, none.get((recorded, lam)), 0)
-            yield ("symmetry", f"{mapped}, and {N} recorded in all: at most {MARGIN} points worse", curves,
-                   none.get((N, lam)), MARGIN)  # fmt: skip
 
 
 def findings_lines(runs):
