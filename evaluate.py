@@ -438,14 +438,12 @@ def print_agents():
 def check(flags):
     """{name: (task, source)} of what the flags name. Raises logx.BadInput."""
     film.check(flags.gif, flags.watch)
-    changed = {name for name, value in vars(flags).items() if value != getattr(Flags, name)}
-    for there, useless, where in (
-        (flags.list, changed - {"list"}, "--list"),
+    pid_demo.refuse_useless(
+        flags,
+        (flags.list, set(vars(flags)) - {"list"}, "--list"),
         (flags.gif or flags.watch, {"trials", "jobs", "out"}, "--gif, --watch"),
         (flags.show, {"first_trial"}, "--show"),
-    ):
-        for name in sorted(changed & useless) if there else ():
-            raise logx.BadInput(f"{'RUN' if name == 'runs' else '--' + name}: does not go with {where}")
+    )
     of_pid = flags.task or flags.gains or flags.out
     for wrong, message in (
         (not (flags.pid or flags.runs or flags.list), "RUN: name run folders (--list prints some), or --pid --task T"),

@@ -420,22 +420,32 @@ class Flags:
     seed: int = flag(0, low=0)
 
 
+def refuse_useless(flags, *rules):
+    """Raises BadInput for a flag that was given and would do nothing, by rules (whether it holds, flags, what they do
+    not go with); of evaluate.py too."""
+    fields = sorted(dataclasses.fields(flags), key=lambda field: field.name)
+    for there, useless, where in rules:
+        for field in fields if there else ():
+            if field.name in useless and getattr(flags, field.name) != field.default:
+                name = field.metadata["metavar"] if field.metadata["positional"] else f"--{field.name}"
+                raise logx.BadInput(f"{name}: does not go with {where}")
+
+
 def check(flags):
     """Raises BadInput where flags do not fit together or a file cannot be written."""
     asked = ("record", "trials", "watch", "gif", "inspect")
     jobs = [f"--{name}" for name in asked if getattr(flags, name)]
     if len(jobs) != 1:
         raise logx.BadInput(f"--{', --'.join(asked)}: one of them is expected" + f", not {' '.join(jobs)}" * bool(jobs))
-    (job,), changed = jobs, {name for name, value in vars(flags).items() if value != getattr(Flags, name)}
-    for there, useless, where in (
-        (flags.inspect, changed - {"inspect"}, job),
+    (job,) = jobs
+    refuse_useless(
+        flags,
+        (flags.inspect, set(vars(flags)) - {"inspect"}, job),
         (flags.watch or flags.gif, {"noise", "symmetry"}, job),
         (flags.trials, {"symmetry"}, job),
         (not TASKS[flags.task].cube, {"clearance"}, f"--task {flags.task}"),
         (flags.stage != "demo", {"symmetry", "partitions"}, f"--stage {flags.stage}"),
-    ):
-        for name in sorted(changed & useless) if there else ():
-            raise logx.BadInput(f"--{name}: does not go with {where}")
+    )
     film.check(flags.gif, flags.watch)
     if bool(flags.record) != bool(flags.out or flags.minari):
         raise logx.BadInput("--record, --out or --minari: --record needs one of the others, and they need it")

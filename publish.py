@@ -240,7 +240,7 @@ def findings_lines(runs):
             continue
         ours_mean, theirs_mean = (np.mean([curves.success for curves in side]) for side in (ours, theirs))
         metric = "P_scs_percent"
-        gap, low, high = tables.difference("P_scs_percent", *([c.success for c in side] for side in (ours, theirs)))
+        gap, low, high = tables.difference(metric, *([c.success for c in side] for side in (ours, theirs)))
         if claim in WITH_PID:
             metric, sign, _ = WITH_PID[claim]
             pairs = [evaluate.paired(curves.evaluations[""], theirs[0].evaluations[""]) for curves in ours]

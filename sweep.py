@@ -306,9 +306,11 @@ class SlurmJob:
     def checkpoint(self):
         import submitit
 
-        with contextlib.suppress(ProcessLookupError, ChildProcessError, AttributeError):  # ended, or not yet begun
-            os.kill(self.process.pid, signal.SIGTERM)  # it saves its state
-            os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)  # Popen.wait, interrupted by this, is locked
+        if self.process:  # else it has not begun
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):  # it has ended already
+                os.kill(self.process.pid, signal.SIGTERM)  # it saves its state
+                # Popen.wait, interrupted by this, is locked
+                os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)
         return submitit.helpers.DelayedSubmission(SlurmJob(self.job))
 
 

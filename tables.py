@@ -439,24 +439,25 @@ def table_notes(kind, rows):
 def ranked(kind, rows):
     """Lines: of the pairs of columns, of a sweep or with the baseline, that the paper ranks by the table's main metric,
     how many our seeds rank alike, and those that they rank the other way."""
-    metric, verdicts, found = RANKED[kind], ("rank the other way", "cannot tell apart", "agree on"), {}
+    metric, found = RANKED[kind], {}
     for _, group in rows[(rows.metric == metric) & (rows.evaluation == "")].groupby(GROUP):
         for one, other in combinations(group.itertuples(), 2):
             compared = one.sweep == other.sweep or "baseline" in (one.sweep, other.sweep)
             if not (compared and abs(one.paper - other.paper) > 0):  # not where either is NaN
                 continue
             gap, low, high = difference(metric, one.values, other.values)
-            alike = (gap > 0) == (one.paper > other.paper)
+            verdict = ("" if low != low else "cannot tell apart" if low <= 0 <= high else
+                       "agree on" if (gap > 0) == (one.paper > other.paper) else "rank the other way")  # fmt: skip
             pair = " and ".join(f"N_demos={row.num_demos} lambda_BC={row.lambda_bc:g}" for row in (one, other))
             label = group_label([getattr(one, name) for name in GROUP])
             line = (f"  {pair}: the paper's {one.paper:g} and {other.paper:g}, our difference "
                     f"{between(gap, low, high, METRICS[kind][metric])} ({label})")  # fmt: skip
-            found[line] = "" if low != low else verdicts[1] if low <= 0 <= high else verdicts[2 * alike]
+            found[line] = verdict
     counts = Counter(found.values())
     heads = [f"Pairs that the paper's {metric} ranks, by Welch's 95 % interval of our difference: "
-             + ", ".join(f"{counts[verdict]} we {verdict}" for verdict in verdicts)
+             + ", ".join(f"{counts[v]} we {v}" for v in ("rank the other way", "cannot tell apart", "agree on"))
              + f"; {counts['']} of a single seed" * (counts[""] > 0)] * bool(found)  # fmt: skip
-    return [*heads, *(line for line, verdict in found.items() if verdict == verdicts[0])]
+    return [*heads, *(line for line, verdict in found.items() if verdict == "rank the other way")]
 
 
 def compared_lines(kind, runs):
