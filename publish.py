@@ -96,8 +96,9 @@ def files_of_run(folder):
         data = path.read_bytes() if path.suffix == ".gz" else gzip.compress(path.read_bytes(), mtime=0)
         files[f"{path.name.removesuffix('.gz')}.gz"] = data
     printed = tables.columns(run.row["task"])
-    drawn = run.row["variant"] == "" and ((run.row["num_demos"], run.row["lambda_bc"])
-                                          in set(zip(printed.num_demos, printed.lambda_bc, strict=True)))  # fmt: skip
+    own = run.own_length and run.row["symmetry"] == tables.OWN_SYMMETRY.get(run.row["recipe"])
+    column = (run.row["num_demos"], run.row["lambda_bc"]) in set(zip(printed.num_demos, printed.lambda_bc, strict=True))
+    drawn = (run.pid or own) and run.row["variant"] == "" and column
     if "" in run.evaluations and run.trajectories.exists() and drawn:  # the successful trials alone
         won = run.evaluations[""].query("success == 1")
         errors, (_, paths) = tables.read_errors(run.trajectories), tables.read_paths(run.trajectories)

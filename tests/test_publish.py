@@ -50,7 +50,9 @@ def test_a_published_run_is_whole_without_machine_paths_and_the_same_bytes_each_
     assert row["git_commit"] == COMMIT
 
 
-@pytest.mark.parametrize("config", [{"num_demos": 7}, {"variant": "n_step=1"}])
+@pytest.mark.parametrize(
+    "config", [{"num_demos": 7}, {"variant": "n_step=1"}, {"symmetry": "so2"}, {"own_length": False}]
+)
 def test_trajectories_are_published_of_what_a_figure_may_show(tmp_path, config):
     main(["--publish", str(publishable(tmp_path / "runs/a", **config))])
     assert (tmp_path / "results/a/evaluation.csv.gz").exists()
