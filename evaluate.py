@@ -54,7 +54,8 @@ VALIDATION, UNSEEN = 10_000, 50_000  # trials between these are for choosing; 0 
 PATHS = 20  # trials whose TCP paths are kept
 COLUMNS = ["trial", "success", "failure", "grasped", "length", "return", "effort_percent", "final_error_cm", "e95_cm",
            "goal_theta", "goal_rho", "goal_z"]  # fmt: skip
-OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length"}
+OF_SUCCESSFUL = {"T_eff": "effort_percent", "R_test": "return", "E_95_cm": "e95_cm", "steps": "length",
+                 "final_error_cm": "final_error_cm"}  # {metric: column}  # fmt: skip
 
 
 @dataclass
@@ -317,7 +318,8 @@ def print_table(results, versus=None):
 
     def cells(found):
         texts = []
-        for (_, d, width), (mean, low, high) in zip(CELLS.values(), found.values(), strict=True):
+        for metric, (_, d, width) in CELLS.items():
+            mean, low, high = found[metric]
             ends = f"[{low:.{d}f}, {high:.{d}f}]" if low < high else "[-]"  # none of a single trial, or of trials alike
             texts.append((f"{mean:.{d}f} {ends}" if mean == mean else "N/A").ljust(width))
         return "  " + " ".join(texts)

@@ -13,9 +13,9 @@ in --table ablations, partitions, and --figure symmetry, success alone then.
 What the numbers are, and which runs form a group: tables.py.
 
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
-where NAME is results, verdicts, findings, watched, demonstrator, parts, cost,
-figures, or training, test, ablations, symmetries, partitions, figures with
--p2p, -p2po, -pnp. --report rewrites what is between them in README.md,
+where NAME is results, verdicts, findings, beside-pid, parts, watched, cost,
+demonstrator, figures, or training, test, ablations, symmetries, partitions,
+figures with -p2p, -p2po, -pnp. --report rewrites what is between them in README.md,
 DIFFERENCES.md and data/results/README.md from data/results, and draws there.
 """
 
@@ -104,7 +104,7 @@ def caption(figure, *sentences):
 
 
 BAND = "Mean over seeds and its 95 % band (Student)."
-THIN = "Thin: the mean of those that go on, once the shortest run of a column has ended."
+ENDS = "A line ends with the shortest of its runs."
 
 
 def draw_band(ax, x, values, label, metric="", **look):
@@ -115,14 +115,13 @@ def draw_band(ax, x, values, label, metric="", **look):
 
 
 def draw_curve(ax, runs, label, **look):
-    """Return over episodes: mean and band as far as every seed goes; thin, the mean of those that go on."""
+    """Return over episodes, as far as every seed goes."""
     curves = [tables.running_mean(curves.episodes["return"]) for curves in runs.curves]
-    every, longest = min(map(len, curves)), max(map(len, curves))
-    curves = np.array([np.pad(curve, (0, longest - len(curve)), constant_values=np.nan) for curve in curves])
+    every = min(map(len, curves))
+    curves = np.array([curve[:every] for curve in curves])
     start = min(9, every // 2)  # the mean of one or two returns is noise that would set the scale of the axis
     shown = np.unique(np.linspace(start, every - 1, 200).astype(int))
     draw_band(ax, shown + 1, curves[:, shown], f"{label} ({seeds_label(runs)})", **look)
-    ax.plot(np.arange(every, longest + 1), np.nanmean(curves[:, every - 1 :], axis=0), linewidth=0.6, alpha=0.7, **look)
 
 
 def named(runs, flags):
@@ -144,7 +143,7 @@ def named_learning_figure(task, lines):
     ax.set(xlabel="episode", ylabel=f"return (mean of last {tables.WINDOW} episodes)", xlim=(0, None))
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17))
     figure.suptitle(TITLES[task], fontsize=9)
-    caption(figure, BAND, THIN)
+    caption(figure, BAND, ENDS)
     return figure
 
 
@@ -181,7 +180,7 @@ def learning_figure(task, runs, flags):
     ends = min(heights) - 0.5, max(heights) + 0.5  # not those of the bands: two seeds' would set the scale
     axes[0].set(ylim=ends, ylabel=f"return (mean of last {tables.WINDOW} episodes)")
     hidden = title(figure, task, group, runs)
-    caption(figure, BAND, THIN, f"No runs yet: {', '.join(empty)}." if empty else "", hidden)
+    caption(figure, BAND, ENDS, f"No runs yet: {', '.join(empty)}." if empty else "", hidden)
     return figure
 
 
@@ -223,12 +222,14 @@ def success_figure(task, runs, flags):
 
 def symmetry_figure(task, runs, flags):
     """Test success over the number of recorded demonstrations, a line a symmetry; and of `gas` over the number of
-    partitions K, at as many recorded and at as many after mapping. Robust runs of the commonest length."""
+    partitions K, at as many recorded and at as many after mapping. Robust runs, of the length of most symmetries."""
     best = tables.best_column(task, runs)
     runs = runs[(runs.algo == best.algo) & (runs.recipe == "robust") & (runs.lambda_bc == best.lambda_bc)]
     runs = runs[(runs.num_demos > 0) & runs.variant.str.fullmatch(r"(partitions=\d+)?")]
-    runs = runs[runs.finished & (runs.total_env_steps == runs.total_env_steps.mode().max())]
-    runs = runs.assign(success=[curves.success for curves in runs.curves]).dropna(subset="success")
+    runs = runs[runs.finished].assign(success=lambda runs: [curves.success for curves in runs.curves])
+    runs = runs.dropna(subset="success")
+    lengths = runs.groupby("total_env_steps").symmetry.agg(["nunique", "size"]).sort_values(["nunique", "size"])
+    runs = runs[runs.total_env_steps.isin(lengths.index[-1:])]
     over_K, over_n = runs[runs.symmetry == "gas"], runs[runs.variant == ""]
     if over_n.recorded.nunique() < 2:
         return None
@@ -272,8 +273,8 @@ def symmetry_figure(task, runs, flags):
 
 
 def error_figure(task, runs, flags):
-    """||e_t|| over all successful test trials, a panel a column (Fig. 10, 11, 12). A trial that has ended keeps its
-    last error: each counts alike at every t."""
+    """||e_t|| over all successful test trials, a panel a column with more than 5 % of them (Fig. 10, 11, 12). A trial
+    that has ended keeps its last error: each counts alike at every t."""
     group, panels = main_group(task, runs, flags.recipe), {}
     of_all = named(runs, flags)
     parts = of_all or {column_label(column, "both"): of_column(group, column)
@@ -281,9 +282,10 @@ def error_figure(task, runs, flags):
                        if column.sweep != "pid"}  # fmt: skip
     for label, part in parts.items():
         paths = [c.trajectories for c in part.curves if c.trajectories.exists()]
-        if errors := [error for path in paths for error in tables.read_errors(path)]:
+        errors = [error for path in paths for error in tables.read_errors(path)]
+        tried = sum(len(c.evaluations[""]) for c in part.curves if c.trajectories.exists() and "" in c.evaluations)
+        if len(errors) > 0.05 * tried:  # of fewer, those of the nearest goals alone
             seeds = f"{len(paths)} seed{'s' * (len(paths) > 1)}"
-            tried = sum(len(c.evaluations[""]) for c in part.curves if c.trajectories.exists() and "" in c.evaluations)
             head = textwrap.fill(label, 34) if of_all else label
             panels[f"{head}\n{len(errors):,} of {max(tried, len(errors)):,} trials, {seeds}"] = errors
     if not panels:
@@ -313,7 +315,7 @@ def error_figure(task, runs, flags):
     else:
         hidden = title(figure, task, group, runs)
     caption(figure, r"Mean $\pm$ standard deviation over all successful test trials; dotted: $\epsilon$. A trial that "
-            "has ended keeps its last error.", hidden)  # fmt: skip
+            "has ended keeps its last error. Not drawn: columns with at most 5 % of them.", hidden)  # fmt: skip
     return figure
 
 

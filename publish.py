@@ -163,18 +163,24 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "lambda": "A larger λ_BC is better",
     "demos": "More demonstrations are better",
     "plain": "Demo-EASE beats the plain algorithm",
-    "mask": "The mask matters",
+    "mask": "Cloning with the mask is better than without",
     "mapping": "Demonstrations of one partition, mapped to all, are better than as many of all",
     "symmetry": "Symmetric demonstrations cost less: mapped ones are as good as recorded ones, within 5 points",
-    "PID": "The agent beats its demonstrator",
-    "error": "The agent ends nearer to the goal than its demonstrator",
-    "return": "The agent's return is larger than its demonstrator's",
-    "effort": "The agent needs more effort than its demonstrator",
-    "quick": "The agent is quicker than its demonstrator (ours)",
+    "P_scs_percent": "The agent beats its demonstrator",
+    "E_95_cm": "The agent's E_95 is smaller than its demonstrator's",
+    "R_test": "The agent's return is larger than its demonstrator's",
+    "T_eff": "The agent needs more effort than its demonstrator",
+    "steps": "The agent is quicker than its demonstrator (ours)",
+    "final_error_cm": "The agent ends nearer to the goal than its demonstrator (ours)",
 }
-WITH_PID = {"PID": ("P_scs_percent", 1, "points"), "error": ("E_95_cm", -1, "cm less"),
-            "return": ("R_test", 1, "of R_test"), "effort": ("T_eff", 1, "points of T_eff"),
-            "quick": ("steps", -1, "steps fewer")}  # {claim: (metric of evaluate.paired, sign, unit)}  # fmt: skip
+BESIDE_PID = {  # {metric of evaluate.paired: (its name, 1 where more is claimed or -1 where less, decimals)}
+    "P_scs_percent": ("success (points)", 1, 1),
+    "E_95_cm": ("E_95 (cm)", -1, 2),
+    "R_test": ("return", 1, 2),
+    "T_eff": ("effort (points)", 1, 1),
+    "steps": ("steps", -1, 0),
+    "final_error_cm": ("last error (cm)", -1, 2),
+}
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
 UNSEEN = f"first trial {evaluate.UNSEEN}"  # 500 trials that were seen of PPO alone while the recipes came about
@@ -193,10 +199,13 @@ def comparisons(task, runs):
     at = {group: {key: list(part.curves) for key, part in members.groupby(COLUMN[1:])} for group, members in groups}
     for group, found in at.items():
         (algo, recipe, symmetry, variant, total), label = group, group_label(group)
+        own_group = (algo, recipe, symmetry, "", total)  # with all of the recipe's flags
+        own = at.get(own_group, {})
+        plain = [curves for (N, _), part in own.items() if not N for curves in part]
         if variant == "mask=none":
-            with_mask = (algo, recipe, symmetry, "", total)
-            masked = at.get(with_mask, {}).get(key)
-            yield "mask", f"{group_label(with_mask)}, and with mask=none", masked, found.get(key), 0
+            yield "mask", f"{group_label(own_group)}, and with mask=none", own.get(key), found.get(key), 0
+        if variant in ("", "clone_iters=0"):
+            yield "plain", f"{label}: with demonstrations, and without", found.get(key), plain, 0
         for (N, lam), curves in found.items() if (symmetry, variant) == ("gas", "") else ():
             recorded, none = curves[0].row["recorded"], at.get((algo, recipe, "none", "", total), {})
             mapped = f"{label}: {recorded} recorded in one partition and mapped to {N}"
@@ -204,79 +213,96 @@ def comparisons(task, runs):
             yield ("symmetry", f"{mapped}, and {N} recorded in all: at most {MARGIN} points worse", curves,
                    none.get((N, lam)), MARGIN)  # fmt: skip
         own_length = all(curves.own_length for side in found.values() for curves in side)
-        if variant not in ("", *(f"gains={name}" for name in pid_demo.GAINS)) or not (variant or own_length):
-            continue  # a recipe of another length is there for the ablations
-        if symmetry == tables.OWN_SYMMETRY.get(recipe):
+        own_symmetry = symmetry == tables.OWN_SYMMETRY.get(recipe)
+        if own_symmetry and (variant == "" and own_length or variant.removeprefix("gains=") in pid_demo.GAINS):
             gains = found[key][0].config["gains"] if key in found else None
-            theirs, compared = pid.get(gains), f"{label}, and the PID with {gains} gains in the same trials"
-            others = theirs[0].evaluations.items() if theirs else ()
-            at_length = [f"{what} {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in others
-                         if what.startswith("horizon")]  # fmt: skip
-            yield "PID", compared + f" (at the {', '.join(at_length)})" * bool(at_length), found.get(key), theirs, 0
-            for claim in [claim for claim in WITH_PID if claim != "PID"]:
-                yield claim, compared, found.get(key), theirs, 0
-        if variant or recipe not in tables.OWN_SYMMETRY:
-            continue
+            for metric in BESIDE_PID:
+                yield metric, label, found.get(key), pid.get(gains), 0
+        if variant or recipe not in tables.OWN_SYMMETRY or own_symmetry and not own_length:
+            continue  # a recipe of another length is there for the ablations
         pairs, counts = list(ends.items()), sorted(n for n in found if n[0] and n[1] == best.lambda_bc)
         if len(counts) > 1:  # as in the study of the symmetries
             pairs.append(("demos", (counts[-1], counts[0])))
         for sweep, (high, low) in dict.fromkeys(pairs):
             names = [f"{N} demonstrations, λ_BC = {lam:g}" for N, lam in (high, low)]
             yield sweep, f"{label}: {' and '.join(names)}", found.get(high), found.get(low), 0
-        plain = [curves for (N, _), part in found.items() if not N for curves in part]
-        yield "plain", f"{label}: with demonstrations, and without", found.get(key), plain, 0
 
 
-def findings_lines(runs):
-    """Each claim of the paper, the difference in our test success, first side minus second, and what it says: Welch's
-    interval over seeds; with the PID, which is one controller, Student's of the differences from it in the same trials.
-    Comparisons with a single seed on a side have no interval and say nothing."""
-    lines, said = [["claim", "task", "compared", "success (%)", "difference", "seeds", ""]], {}
+def findings(runs):
+    """A dict for each comparison: its claim of CLAIMS, its task, what is compared, the sides' Curves and success, their
+    difference in the claim's direction and what that says. The interval is Welch's over seeds; beside the PID, which is
+    one controller, Student's of the differences from it in the same trials. Comparisons with a single seed on a side
+    have no interval and say nothing."""
     found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
-        of_both = claim in WITH_PID and claim != "PID"  # of the trials that both succeed in
+        of_both = claim in BESIDE_PID and claim != "P_scs_percent"  # of the trials that both succeed in
         least = 5 if of_both else 0  # percent: with less, next to no trial is one that both succeed in
-        ours, theirs = ([curves for curves in side or () if curves.success >= least] for side in (one, other))
-        if not (ours and theirs):
+        sides = [[curves for curves in side or () if curves.success >= least] for side in (one, other)]
+        if not all(sides):
             continue
-        ours_mean, theirs_mean = (np.mean([curves.success for curves in side]) for side in (ours, theirs))
-        metric = "P_scs_percent"
-        gap, low, high = tables.difference(metric, *([c.success for c in side] for side in (ours, theirs)))
-        if claim in WITH_PID:
-            metric, sign, _ = WITH_PID[claim]
-            pairs = [evaluate.paired(curves.evaluations[""], theirs[0].evaluations[""]) for curves in ours]
-            gap, *ends = evaluate.over_seeds([sign * pair[metric][0] for pair in pairs])
+        by_seed = [[curves.success for curves in side] for side in sides]
+        means, digits = [np.mean(side) for side in by_seed], 1
+        gap, low, high = tables.difference("P_scs_percent", *by_seed)
+        if claim in BESIDE_PID:
+            _, sign, digits = BESIDE_PID[claim]
+            ours, (pid,) = ([curves.evaluations[""] for curves in side] for side in sides)
+            gap, *ends = evaluate.over_seeds([sign * evaluate.paired(trials, pid)[claim][0] for trials in ours])
             low, high = ends if of_both else np.clip(ends, -100, 100)
-        full = claim == "PID" and theirs_mean >= CEILING
+        full = claim == "P_scs_percent" and means[1] >= CEILING
         if not low < high and not (full and low == high):  # a single seed says nothing, nor do seeds without a spread
             continue
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
-        if full and high > -MARGIN:
+        if full and low > -MARGIN:
             verdict = "no room above it" + ", and below" * bool(high < 0)
-        if of_both:
-            both = np.mean([sum(c.evaluations[""].success * theirs[0].evaluations[""].success) for c in ours])
-            compared += f", {both:.0f} that both succeed in"
-        *_, unit = WITH_PID.get(claim, ["points"])
-        seeds = f"{len(ours)}" if claim in WITH_PID else f"{len(ours)} and {len(theirs)}"
-        said.setdefault(claim, []).append([
-            TITLES[task], compared, f"{ours_mean:.1f} and {theirs_mean:.1f}",
-            f"{between(gap, low, high, METRICS['test'].get(metric, 1))} {unit}", seeds, f"*{verdict}*"])  # fmt: skip
-    for claim, sentence in CLAIMS.items():
-        lines += [[sentence, *line] for line in said.get(claim, [["", "not yet run with two seeds a side", *[""] * 4]])]
+        apart = claim not in BESIDE_PID and tables.separated(*by_seed)
+        yield {"claim": claim, "task": TITLES[task], "compared": compared, "verdict": verdict, "sides": sides,
+               "success": " and ".join(f"{mean:.1f}" for mean in means),
+               "difference": between(gap, low, high, digits) + " †" * apart,
+               "seeds": " and ".join(str(len(side)) for side in sides if not side[0].pid)}  # fmt: skip
+
+
+def findings_lines(runs):
+    """The comparisons of agents with agents, in the order of CLAIMS."""
+    lines, found = [["claim", "task", "compared", "success (%)", "difference (points)", "seeds", ""]], [*findings(runs)]
+    for claim in (claim for claim in CLAIMS if claim not in BESIDE_PID):
+        said = [[x["task"], x["compared"], x["success"], x["difference"], x["seeds"], f"*{x['verdict']}*"]
+                for x in found if x["claim"] == claim]  # fmt: skip
+        said = said or [["", "not yet run with two seeds a side", *[""] * 4]]
+        lines += [[CLAIMS[claim] * (i == 0), *line] for i, line in enumerate(said)]
+    return lines
+
+
+def beside_pid_lines(runs):
+    """Agents beside the PID that they were shown, in the same trials: a line an agent, a column a claim."""
+    lines, beside = [["task", "agent", "seeds", "PID's gains", "success (%)", "PID, given longer (%)", "both succeed",
+                      *(f"{name}, {('', 'agent minus PID', 'PID minus agent')[sign]}"
+                        for name, sign, _ in BESIDE_PID.values())]], {}  # fmt: skip
+    for x in findings(runs):
+        if x["claim"] in BESIDE_PID:
+            beside.setdefault((x["task"], x["compared"]), {})[x["claim"]] = x
+    for (title, agent), found in beside.items():
+        ours, (pid,) = (x := next(iter(found.values())))["sides"]
+        longer = [f"{what}: {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in pid.evaluations.items()
+                  if what.startswith("horizon")]  # fmt: skip
+        both = np.mean([sum(c.evaluations[""].success * pid.evaluations[""].success) for c in ours])
+        cells = [f"{found[m]['difference']}: {found[m]['verdict']}" if m in found else "-" for m in BESIDE_PID]
+        lines.append([title, agent, x["seeds"], pid.config["gains"], x["success"], ", ".join(longer) or "-",
+                      f"{both:.0f}", *cells])  # fmt: skip
     return lines
 
 
 def verdicts_lines(runs):
     """The findings at a glance: by claim and task the verdict with its number, of several comparisons in how many."""
-    found = findings_lines(runs)[1:]
-    lines = [["claim", *(TITLES[task] for task in PRINTED)]]
-    for sentence in CLAIMS.values():
+    lines, found = [["claim", *(TITLES[task] for task in PRINTED)]], [*findings(runs)]
+    for claim, sentence in CLAIMS.items():
         cells = []
         for title in lines[0][1:]:
-            said = [(line[-1].strip("*"), line[4]) for line in found if line[:2] == [sentence, title]]
-            counts = Counter(verdict for verdict, _ in said).most_common()
-            cells.append(": ".join(said[0]) if len(said) == 1 else
-                         "; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-")  # fmt: skip
+            said = [x for x in found if (x["claim"], x["task"]) == (claim, title)]
+            counts = Counter(x["verdict"] for x in said).most_common()
+            cells.append("; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-")
+            if len(said) == 1:
+                (x,) = said
+                cells[-1] = f"{x['verdict']}: {x['difference']} points, {x['seeds']} seeds"
         lines.append([sentence, *cells])
     return lines
 
@@ -424,8 +450,9 @@ def table_lines(kind, task, runs):
 
 BLOCKS = {f"{kind}-{task}": partial(table_lines, kind, task) for kind in (*METRICS, *COMPARED) for task in PRINTED}
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
-    ("results", results_lines), ("verdicts", verdicts_lines), ("findings", findings_lines), ("watched", watched_lines),
-    ("parts", parts_lines), ("cost", cost_lines), ("demonstrator", pid_lines))}  # fmt: skip
+    ("results", results_lines), ("verdicts", verdicts_lines), ("findings", findings_lines), ("parts", parts_lines),
+    ("beside-pid", beside_pid_lines), ("watched", watched_lines), ("cost", cost_lines),
+    ("demonstrator", pid_lines))}  # fmt: skip
 
 
 # ---- pages -----------------------------------------------------------------------------------------------------------

@@ -221,11 +221,11 @@ def trial_row(success, **values):
 
 
 def test_metrics_average_the_successful_trials_only():
-    rows = [trial_row(1, effort_percent=10, length=100, e95_cm=4, **{"return": 9.0}),
+    rows = [trial_row(1, effort_percent=10, length=100, e95_cm=4, final_error_cm=2, **{"return": 9.0}),
             trial_row(0, effort_percent=90, length=400, e95_cm=80, **{"return": -2.0}),
-            trial_row(1, effort_percent=20, length=140, e95_cm=6, **{"return": 9.5}),
+            trial_row(1, effort_percent=20, length=140, e95_cm=6, final_error_cm=3, **{"return": 9.5}),
             trial_row(0, effort_percent=90, length=400, e95_cm=80, **{"return": -2.0})]  # fmt: skip
-    found = {"P_scs_percent": 50, "T_eff": 15, "R_test": 9.25, "E_95_cm": 5, "steps": 120}
+    found = {"P_scs_percent": 50, "T_eff": 15, "R_test": 9.25, "E_95_cm": 5, "steps": 120, "final_error_cm": 2.5}
     assert evaluate.metrics(rows) == found
     pandas = pytest.importorskip("pandas")
     assert evaluate.metrics(pandas.DataFrame(rows)) == found
@@ -289,7 +289,7 @@ def test_the_table_prints_where_no_trial_succeeded_and_fits_100_columns(capsys):
     values = dict(effort_percent=12.3, length=123, e95_cm=4.56)
     won = [trial_row(1, trial=i, **values, **{"return": 10 + i / 7}) for i in range(3)]
     m = evaluate.metrics(lost)
-    assert m.pop("P_scs_percent") == 0 and len(m) == 4 and all(math.isnan(value) for value in m.values())
+    assert m.pop("P_scs_percent") == 0 and len(m) == 5 and all(math.isnan(value) for value in m.values())
     evaluate.print_table({"an agent": lost, "another": won}, versus="an agent")
     lines = capsys.readouterr().out.splitlines()
     assert lines[1] == "an agent" and lines[2].split() == ["0.0", "[0.0,", "56.1]", "N/A", "N/A", "N/A", "N/A"]
