@@ -255,10 +255,15 @@ def load_demos(path, task=None):
     return demos, meta
 
 
-def read_file(path):
+def open_npz(path):
+    """numpy.load of arrays only. Raises ValueError where it is no .npz: numpy would advise to trust the file."""
     if os.path.isfile(path) and not zipfile.is_zipfile(path):
         raise ValueError("it is no .npz, or one cut short")
-    with np.load(path, allow_pickle=False) as file:
+    return np.load(path, allow_pickle=False)
+
+
+def read_file(path):
+    with open_npz(path) as file:
         demos = {name: file[name] for name in file.files}
     return demos, json.loads(str(demos.pop("meta")))
 
@@ -360,7 +365,7 @@ def demonstrations(flags):
 def check_used(flags, defaults):
     """Raises BadInput where flags of an algorithm script that need demonstrations are other than its recipe's
     `defaults`, and there are none."""
-    of_demos = "clone_iters keep_clone demo_noise normalize_obs mask demos_per_epoch"
+    of_demos = "clone_iters keep_clone demo_noise normalize_obs mask demos_per_epoch partitions"
     for name in of_demos.split() if flags.num_demos == 0 else ():
         if getattr(flags, name, 0) not in (0, defaults.get(name, getattr(type(flags), name, 0))):
             raise logx.BadInput(f"--{name}: is of demonstrations, and --num_demos 0 has none")

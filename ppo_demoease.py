@@ -155,7 +155,7 @@ def discounted_sum(x, end, last, discount):
 
 
 def advantages(r, end, V, last_V, gamma, lam):
-    """A^_t by GAE (Alg. 2), mean 0 and deviation 1 over the batch (spinningup). All (M,)."""
+    """A^_t by GAE (Alg. 2), mean 0 and deviation 1 over B_o (spinningup). All (M,)."""
     delta = r + gamma * torch.where(end > 0, last_V, V.roll(-1)) - V
     A = discounted_sum(delta, end, torch.zeros_like(delta), gamma * lam)
     return (A - A.mean()) / A.std(correction=0).clamp(min=1e-8)

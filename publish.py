@@ -148,7 +148,9 @@ def publish(sources):
             if (path.parent / "policy.pt").exists():
                 late = tables.late(run["curves"].validation)  # the test trials choose nothing
                 best = best_column(run["task"], pd.DataFrame([run]))
-                other = (run["variant"], run["num_demos"], run["lambda_bc"]) != ("", best.num_demos, best.lambda_bc)
+                own = run["curves"].own_length and tables.own_symmetry(pd.DataFrame([run])).all()
+                column = run["variant"], run["num_demos"], run["lambda_bc"]
+                other = not own or column != ("", best.num_demos, best.lambda_bc)
                 rank = other, -np.nan_to_num(late, nan=-1), -run["steps"], path.parent.name
                 trained.setdefault((run["task"], run["algo"], run["recipe"]), []).append(rank)
     for *_, name in (rank for ranks in trained.values() for rank in sorted(ranks)[1:]):
@@ -181,8 +183,10 @@ BESIDE_PID = {  # {metric of evaluate.paired: (its name, 1 where more is claimed
     "steps": ("steps", -1, 0),
     "final_error_cm": ("last error (cm)", -1, 2),
 }
+UNITS = {"E_95_cm": "cm", "R_test": "of return", "steps": "steps", "final_error_cm": "cm"}  # of claims; else points
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
+LEAST = 5  # percent of the trials: with less, next to none is one that both succeed in
 UNSEEN = f"first trial {evaluate.UNSEEN}"  # 500 trials that were seen of PPO alone while the recipes came about
 
 
@@ -236,8 +240,7 @@ def findings(runs):
     found = ((task, *sides) for task in PRINTED for sides in comparisons(task, runs[runs.task == task]))
     for task, claim, compared, one, other, margin in found:
         of_both = claim in BESIDE_PID and claim != "P_scs_percent"  # of the trials that both succeed in
-        least = 5 if of_both else 0  # percent: with less, next to no trial is one that both succeed in
-        sides = [[curves for curves in side or () if curves.success >= least] for side in (one, other)]
+        sides = [[curves for curves in side or () if curves.success >= LEAST * of_both] for side in (one, other)]
         if not all(sides):
             continue
         by_seed = [[curves.success for curves in side] for side in sides]
@@ -284,10 +287,10 @@ def beside_pid_lines(runs):
         ours, (pid,) = (x := next(iter(found.values())))["sides"]
         longer = [f"{what}: {evaluate.metrics(trials)['P_scs_percent']:.1f}" for what, trials in pid.evaluations.items()
                   if what.startswith("horizon")]  # fmt: skip
-        both = np.mean([sum(c.evaluations[""].success * pid.evaluations[""].success) for c in ours])
+        both = [sum(c.evaluations[""].success * pid.evaluations[""].success) for c in ours if c.success >= LEAST]
         cells = [f"{found[m]['difference']}: {found[m]['verdict']}" if m in found else "-" for m in BESIDE_PID]
         lines.append([title, agent, x["seeds"], pid.config["gains"], x["success"], ", ".join(longer) or "-",
-                      f"{both:.0f}", *cells])  # fmt: skip
+                      f"{np.mean(both):.0f}" if both else "-", *cells])  # fmt: skip
     return lines
 
 
@@ -302,7 +305,7 @@ def verdicts_lines(runs):
             cells.append("; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-")
             if len(said) == 1:
                 (x,) = said
-                cells[-1] = f"{x['verdict']}: {x['difference']} points, {x['seeds']} seeds"
+                cells[-1] = f"{x['verdict']}: {x['difference']} {UNITS.get(claim, 'points')}, {x['seeds']} seeds"
         lines.append([sentence, *cells])
     return lines
 
@@ -397,8 +400,8 @@ def parts_lines(runs):
             part, head = re.sub(r" \S+k steps$", "", line[2]), f"{TITLES[task]}, {algo.upper()}"
             if recipe == "robust" and part != "the recipe's":
                 heads += [head] * (head not in heads)
-                found.setdefault(part, {})[head] = f"{line[7]}; {line[9]}"
-    return [["instead of the recipe's", *heads], *([part, *(cells.get(head, "-") for head in heads)]
+                found.setdefault(part, {}).setdefault(head, []).append(f"{line[7]}; {line[9]}")
+    return [["instead of the recipe's", *heads], *([part, *(" / ".join(cells.get(head, "-")) for head in heads)]
                                                    for part, cells in sorted(found.items()))]  # fmt: skip
 
 
@@ -440,7 +443,7 @@ def pid_lines(runs):
     return lines
 
 
-def table_lines(kind, task, runs):
+def table_markdown(kind, task, runs):
     """A table in Markdown; those of the paper without columns of our own recipes that it does not have."""
     printed = columns(task)[COLUMN[1:]].values.tolist() if kind in METRICS else []
     kept = [kind not in METRICS or run.recipe not in tables.OWN_SYMMETRY or [run.num_demos, run.lambda_bc] in printed
@@ -448,7 +451,7 @@ def table_lines(kind, task, runs):
     return make_table(kind, task, runs[np.array(kept, bool)])[1]
 
 
-BLOCKS = {f"{kind}-{task}": partial(table_lines, kind, task) for kind in (*METRICS, *COMPARED) for task in PRINTED}
+BLOCKS = {f"{kind}-{task}": partial(table_markdown, kind, task) for kind in (*METRICS, *COMPARED) for task in PRINTED}
 BLOCKS |= {name: lambda runs, lines=lines: markdown(lines(runs)) for name, lines in (
     ("results", results_lines), ("verdicts", verdicts_lines), ("findings", findings_lines), ("parts", parts_lines),
     ("beside-pid", beside_pid_lines), ("watched", watched_lines), ("cost", cost_lines),
@@ -466,12 +469,15 @@ def marked_pages():
     """{page: its text}. Raises BadInput for a mark that is alone or of no block, and where no run is published."""
     if not any(tables.RESULTS.glob("[!.]*/config.json")):
         raise BadInput(f"--report: no run in {tables.RESULTS}; --publish puts them there")
-    texts = {page: page.read_text(encoding="utf-8") for page in PAGES if page.exists()}
+    texts = {}
+    for page in (page for page in PAGES if page.exists()):
+        with tables.reading(page, "a page in UTF-8"):
+            texts[page] = page.read_text(encoding="utf-8")
     for page, text in texts.items():
         for name in set(MARKED.findall(text)) - {*BLOCKS, *FIGURE_BLOCKS}:
             raise BadInput(f"{page}: <!-- {name} --> is no block of --report; --help lists them")
-        for name in re.findall(r"^<!-- (\S+) -->$", MARKED.sub("", text), re.MULTILINE):
-            raise BadInput(f"{page}: <!-- {name} --> is one mark alone; its block ends with <!-- /{name} -->")
+        for mark, name in re.findall(r"^(<!-- /?(\S+) -->)$", MARKED.sub("", text), re.MULTILINE):
+            raise BadInput(f"{page}: {mark} is one mark alone; <!-- {name} --> and <!-- /{name} --> are expected")
     return texts
 
 

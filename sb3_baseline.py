@@ -31,7 +31,7 @@ class Flags(logx.RunFlags):
     algo: str = flag("sac", "the algorithm", ("sac", "td3", "ddpg"))
     task: str = flag("p2p", "the task", choices=tuple(TASKS))
     num_demos: int = flag(0, "demonstrations in the replay buffer", low=0, high=1_000_000)
-    n_step: int | None = flag(None, "rewards in a target; 1, with demonstrations 10", low=1)
+    n_step: int | None = flag(None, "rewards in a target; 1, with demonstrations 10", low=1, high=1000)
     seed: int = flag(0, "of all that is random", low=0, high=2**32 - 1)
     epochs: int = flag(100, "of 1000 steps", low=1)
     act_noise: float | None = flag(None, "of td3 and ddpg, which have none of their own; 0.1", low=0)

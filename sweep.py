@@ -2,7 +2,7 @@
 
     python sweep.py --task p2p --dry_run            # the commands, and the cost
     python sweep.py --task p2p --recipe robust --jobs 2       # two at a time
-    python sweep.py --task p2p --columns lambda=1.8 baseline --seeds 2 \\
+    python sweep.py --task p2p --columns lambda=1.8 demos=80 --seeds 2 \\
         --vary symmetry=none,gas gamma=0.98,0.99        # 16 runs
     python sweep.py --status                        # how far each run is
     python sweep.py --cluster slurm --partition cpu --time 600
@@ -62,7 +62,7 @@ class Flags:
     vary: tuple[str, ...] | None = flag(None, "values of flags; every combination is run", metavar="FLAG=VALUE,...")
     recipe: str = flag("paper", "the scripts' --recipe", ("paper", "robust"))
     epochs: int | None = flag(None, "the scripts' --epochs; the recipe's", low=1)
-    seeds: int = flag(5, "seeds a column", low=1)
+    seeds: int = flag(5, "seeds a column", low=1, high=100)
     first_seed: int = flag(0, "the first of them", low=0)
     data_dir: Path = flag(Path("data/runs"), "where run folders lie, from the present folder")
     # what to do
@@ -124,9 +124,12 @@ class Job:
         return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
 
     def steps(self):
-        """Environment steps done, by progress.csv; of these a part may have to be done again."""
+        """Environment steps done, by progress.csv; of these a part may have to be done again. Raises ValueError."""
         rows = self.rows()
-        return int(rows[-1]["env_steps"]) if rows else 0
+        try:
+            return int(rows[-1]["env_steps"]) if rows else 0
+        except (LookupError, TypeError, ValueError):
+            raise ValueError(f"{self.folder / 'progress.csv'}: no number of env_steps in its last line") from None
 
     def state(self):
         """(waiting | queued | running | stopped | failed | done, the last line it said where it failed)."""
@@ -381,7 +384,7 @@ def print_status(jobs, data_dir):
                 to_come = hours((job.total - job.steps()) / job.steps() * float(rows[-1]["seconds"])) + " to come"
             print(f"{state:8} {100 * job.steps() / job.total:5.1f} %  {to_come:15} {job.folder}  {error}".rstrip())
             count[state] += 1
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, ZeroDivisionError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
             print(f"{folder}: no run's config.json and progress.csv ({logx.one_line(error)})", file=sys.stderr)
     missing = sum(job.folder not in begun for job in jobs)
     print(", ".join(f"{n} {state}" for state, n in sorted(count.items())) or f"{data_dir}: no runs", end="")
@@ -393,7 +396,10 @@ def main(argv=None):
     jobs = grid(flags)
     if flags.status:
         return print_status(jobs, flags.data_dir)
-    states = {job: job.state()[0] for job in jobs}
+    try:
+        states = {job: job.state()[0] for job in jobs}
+    except ValueError as error:
+        raise logx.BadInput(f"{error}; a run's curve is expected, or remove its folder") from None
     todo = [job for job in jobs if states[job] not in ("done", "running", "queued")]
     cost = costs(todo) if flags.dry_run else {}
     for job in jobs:

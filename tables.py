@@ -1,7 +1,7 @@
 """The runs in data/ as tables: read, grouped, measured as in the paper (Sec. 5).
 
     runs, remarks = tables.find_runs()          # a DataFrame, one row a run
-    lines, notes, frame = tables.make_table("test", "p2p", runs)
+    text, in_markdown, frame = tables.make_table("test", "p2p", runs)
 
 plot_curves.py prints and draws what is here. Runs of one algorithm, recipe,
 symmetry, variant (flags that differ from the recipe's) and length are a group;
@@ -34,6 +34,7 @@ import pandas as pd
 
 import evaluate
 import logx
+import pid_demo
 from evaluate import HERE, RESULTS, RUNS
 from kinova_env import INDEX, TASKS
 from logx import BadInput
@@ -90,7 +91,7 @@ def split(values, length):
 
 def read_errors(path):
     """||e_t|| in m (length + 1,) of each successful trial in a trajectories.npz."""
-    with reading(path, "a trajectories.npz of evaluate.py"), np.load(path, allow_pickle=False) as file:
+    with reading(path, "a trajectories.npz of evaluate.py"), pid_demo.open_npz(path) as file:
         errors = split(file["error"].astype(float), file["length"])
         return [error for error, success in zip(errors, file["success"], strict=True) if success]
 
@@ -98,7 +99,7 @@ def read_errors(path):
 def read_paths(path):
     """(task or None, TCP paths) in a trajectories.npz, a demos-TASK.npz, or a file of pid_demo.py --record: dicts with
     `tcp` (length + 1, 3), `goal`, `object` (3,), in m, NaN where there is none, and `success`."""
-    with reading(path, "an .npz of evaluate.py, or of pid_demo.py --record"), np.load(path, allow_pickle=False) as file:
+    with reading(path, "an .npz of evaluate.py, or of pid_demo.py --record"), pid_demo.open_npz(path) as file:
         task, length = None, file["length"]
         if "obs" in file:
             task = json.loads(str(file["meta"]))["task"]

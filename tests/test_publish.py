@@ -88,10 +88,12 @@ def test_only_the_run_of_a_task_and_recipe_that_is_best_in_validation_keeps_its_
     runs.append(publishable(tmp_path / "runs/2", recipe="paper", success=(0, 0), epochs=3))
     runs.append(publishable(tmp_path / "runs/3", success=(1, 1), variant="n_step=1"))
     runs.append(publishable(tmp_path / "runs/4", validated=1, lambda_bc=0.1))
+    runs.append(publishable(tmp_path / "runs/5", validated=1, symmetry="canonical"))
+    runs.append(publishable(tmp_path / "runs/6", validated=1, own_length=False))
     for run in runs:
         publish.publish([run])
     assert sorted(path.parent.name for path in (tmp_path / "results").rglob("policy.pt")) == ["1", "2"]
-    assert [row["finished"] for row in index(tmp_path)] == ["1", "1", "0", "1", "1"]
+    assert [row["finished"] for row in index(tmp_path)] == ["1", "1", "0", "1", "1", "1", "1"]
 
 
 def test_a_run_takes_the_place_of_an_older_one_of_the_same_name(tmp_path):
@@ -170,9 +172,11 @@ def test_an_agent_is_compared_with_the_pid_that_it_was_shown_of_which_the_succes
         for variant, gains, won in (("", "fast", 200), ("gains=authors", "authors", 199 + seed)):
             folder = tmp_path / f"runs/{gains}{seed}"
             write_run(folder, seed=seed, success=of_200(won), variant=variant, gains=gains)
+    write_run(tmp_path / "runs/lost", seed=2, success=of_200(2), gains="fast")  # hardly any trial that both succeed in
     (tmp_path / "runs/pid-authors/evaluation-horizon_600.csv").write_text(trials((1, 1)))
     assert [line[1:8] for line in publish.beside_pid_lines(tables.find_runs()[0])[1:]] == [
-        ["ddpg robust mirror 4k steps", "2", "fast", "100.0 and 100.0", "-", "200", "0.0 [-]: no room above it"],
+        ["ddpg robust mirror 4k steps", "3", "fast", "67.0 and 100.0", "-", "200",
+         "-33.0 [-100.0, 100.0]: cannot be told apart"],
         ["ddpg robust mirror gains=authors 4k steps", "2", "authors", "99.8 and 50.0", "horizon 600: 100.0", "100",
          "49.8 [46.6, 52.9]: holds"]]  # fmt: skip
 
@@ -237,9 +241,10 @@ def test_report_rewrites_the_marked_blocks_from_data_results_and_leaves_the_rest
 
 def test_a_mark_without_its_other_mark_is_named(tmp_path, monkeypatch):
     publish.publish([publishable(tmp_path / "x/a")])
-    (tmp_path / "README.md").write_text("<!-- results -->\nold\n")
-    with pytest.raises(BadInput, match="README.md: <!-- results --> is one mark alone"):
-        main(["--report"])
+    for mark in ("<!-- results -->", "<!-- /results -->"):
+        (tmp_path / "README.md").write_text(f"{mark}\nold\n")
+        with pytest.raises(BadInput, match=f"README.md: {mark} is one mark alone"):
+            main(["--report"])
 
 
 def test_the_pages_hold_what_the_published_files_say(monkeypatch):

@@ -280,6 +280,16 @@ def test_line_of_the_curve_that_is_being_written_is_left_out(tmp_path):
     assert sweep.Job(tmp_path, 100).steps() == 0
 
 
+@pytest.mark.parametrize("curve", ["foo\nbar\n", "epoch,env_steps\n1,abc\n"])
+def test_damaged_curve_is_one_line_that_names_it(tmp_path, curve):
+    flags = [*SHORT, "--seeds", "1", "--data_dir", str(tmp_path), "--dry_run"]
+    (job,) = jobs_of(*flags)
+    job.folder.mkdir()
+    (job.folder / "progress.csv").write_text(curve)
+    with pytest.raises(logx.BadInput, match="progress.csv: no number of env_steps"):
+        sweep.main(flags)
+
+
 def test_run_that_another_process_holds_is_running_and_its_refusal_is_no_failure(tmp_path, capsys):
     flags = [*SHORT, "--seeds", "1", "--data_dir", str(tmp_path)]
     (job,) = jobs_of(*flags)
