@@ -33,6 +33,7 @@ import pandas as pd
 from matplotlib.figure import Figure  # without pyplot: a PNG is then always drawn by Agg, no display needed
 from matplotlib.lines import Line2D
 
+import gas
 import logx
 import publish
 import tables
@@ -242,10 +243,11 @@ def symmetry_figure(task, runs, flags):
     panels = [x for x in lines if lines[x]]
     figure = Figure(figsize=(3.2 * len(panels) + 0.8 * (len(panels) == 1), 3.2), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    looks = iter(range(99))  # no colour twice
+    labels = dict.fromkeys((*gas.SYMMETRIES, *lines["recorded"], *lines["K"]))
+    looks = {label: style(i) for i, label in enumerate(labels)}  # of a symmetry the same on every task
     for ax, x in zip(axes, panels, strict=True):
         for i, (label, part) in enumerate(lines[x].items()):
-            look = style(next(looks))
+            look = looks[label]
             part = part.sort_values("num_demos").drop_duplicates(["seed", x], keep="last")
             values = part.groupby(x).success.agg(list)
             n = sorted(set(map(len, values)))
