@@ -15,8 +15,9 @@ What the numbers are, and which runs form a group: tables.py.
 A page's results stand between two lines, <!-- NAME --> and <!-- /NAME -->,
 where NAME is results, verdicts, findings, beside-pid, parts, watched, cost,
 demonstrator, figures, or training, test, ablations, symmetries, partitions,
-figures with -p2p, -p2po, -pnp. --report rewrites what is between them in README.md,
-DIFFERENCES.md and data/results/README.md from data/results, and draws there.
+figures with -p2p, -p2po, -pnp. --report rewrites what is between them in
+README.md, DIFFERENCES.md and data/results/README.md from data/results, and
+draws there.
 """
 
 import math
@@ -283,11 +284,11 @@ def error_figure(task, runs, flags):
                        for column in tables.columns(task, group).drop_duplicates(COLUMN).itertuples()
                        if column.sweep != "pid"}  # fmt: skip
     for label, part in parts.items():
-        paths = [c.trajectories for c in part.curves if c.trajectories.exists()]
-        errors = [error for path in paths for error in tables.read_errors(path)]
-        tried = sum(len(c.evaluations[""]) for c in part.curves if c.trajectories.exists() and "" in c.evaluations)
-        if len(errors) > 0.05 * tried:  # of fewer, those of the nearest goals alone
-            seeds = f"{len(paths)} seed{'s' * (len(paths) > 1)}"
+        tested = [curves for curves in part.curves if curves.trajectories.exists()]
+        errors = [error for curves in tested for error in tables.read_errors(curves.trajectories)]
+        tried = sum(len(curves.evaluations[""]) for curves in tested if "" in curves.evaluations)
+        if 100 * len(errors) > publish.LEAST * tried:  # of fewer, those of the nearest goals alone
+            seeds = f"{len(tested)} seed{'s' * (len(tested) > 1)}"
             head = textwrap.fill(label, 34) if of_all else label
             panels[f"{head}\n{len(errors):,} of {max(tried, len(errors)):,} trials, {seeds}"] = errors
     if not panels:
@@ -317,7 +318,8 @@ def error_figure(task, runs, flags):
     else:
         hidden = title(figure, task, group, runs)
     caption(figure, r"Mean $\pm$ standard deviation over all successful test trials; dotted: $\epsilon$. A trial that "
-            "has ended keeps its last error. Not drawn: columns with at most 5 % of them.", hidden)  # fmt: skip
+            "has ended keeps its last error.", f"Not drawn: columns with success in at most {publish.LEAST} %.",
+            hidden)  # fmt: skip
     return figure
 
 

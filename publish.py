@@ -96,9 +96,8 @@ def files_of_run(folder):
         data = path.read_bytes() if path.suffix == ".gz" else gzip.compress(path.read_bytes(), mtime=0)
         files[f"{path.name.removesuffix('.gz')}.gz"] = data
     printed = tables.columns(run.row["task"])
-    own = run.own_length and run.row["symmetry"] == tables.OWN_SYMMETRY.get(run.row["recipe"])
     column = (run.row["num_demos"], run.row["lambda_bc"]) in set(zip(printed.num_demos, printed.lambda_bc, strict=True))
-    drawn = (run.pid or own) and run.row["variant"] == "" and column
+    drawn = (run.pid or run.own_flags) and column
     if "" in run.evaluations and run.trajectories.exists() and drawn:  # the successful trials alone
         won = run.evaluations[""].query("success == 1")
         errors, (_, paths) = tables.read_errors(run.trajectories), tables.read_paths(run.trajectories)
@@ -148,9 +147,8 @@ def publish(sources):
             if (path.parent / "policy.pt").exists():
                 late = tables.late(run["curves"].validation)  # the test trials choose nothing
                 best = best_column(run["task"], pd.DataFrame([run]))
-                own = run["curves"].own_length and tables.own_symmetry(pd.DataFrame([run])).all()
-                column = run["variant"], run["num_demos"], run["lambda_bc"]
-                other = not own or column != ("", best.num_demos, best.lambda_bc)
+                column = run["num_demos"], run["lambda_bc"]
+                other = not run["curves"].own_flags or column != (best.num_demos, best.lambda_bc)
                 rank = other, -np.nan_to_num(late, nan=-1), -run["steps"], path.parent.name
                 trained.setdefault((run["task"], run["algo"], run["recipe"]), []).append(rank)
     for *_, name in (rank for ranks in trained.values() for rank in sorted(ranks)[1:]):
@@ -175,15 +173,14 @@ CLAIMS = {  # of the paper: Sec. 5, 3.4 (mask) and 3.2 (symmetry)
     "steps": "The agent is quicker than its demonstrator (ours)",
     "final_error_cm": "The agent ends nearer to the goal than its demonstrator (ours)",
 }
-BESIDE_PID = {  # {metric of evaluate.paired: (its name, 1 where more is claimed or -1 where less, decimals)}
-    "P_scs_percent": ("success (points)", 1, 1),
-    "E_95_cm": ("E_95 (cm)", -1, 2),
-    "R_test": ("return", 1, 2),
-    "T_eff": ("effort (points)", 1, 1),
-    "steps": ("steps", -1, 0),
-    "final_error_cm": ("last error (cm)", -1, 2),
+BESIDE_PID = {  # {metric of evaluate.paired: (its column, unit, 1 where more is claimed or -1 where less, decimals)}
+    "P_scs_percent": ("success (points)", "points", 1, 1),
+    "E_95_cm": ("E_95 (cm)", "cm", -1, 2),
+    "R_test": ("return", "of return", 1, 2),
+    "T_eff": ("effort (points)", "points", 1, 1),
+    "steps": ("steps", "steps", -1, 0),
+    "final_error_cm": ("last error (cm)", "cm", -1, 2),
 }
-UNITS = {"E_95_cm": "cm", "R_test": "of return", "steps": "steps", "final_error_cm": "cm"}  # of claims; else points
 MARGIN = 5  # points of test success that mapped demonstrations may be worse than as many recorded ones
 CEILING = 99  # percent of the trials; beside a PID with more an agent cannot be better, only quicker
 LEAST = 5  # percent of the trials: with less, next to none is one that both succeed in
@@ -244,23 +241,24 @@ def findings(runs):
         if not all(sides):
             continue
         by_seed = [[curves.success for curves in side] for side in sides]
-        means, digits = [np.mean(side) for side in by_seed], 1
-        gap, low, high = tables.difference("P_scs_percent", *by_seed)
+        means, apart = [np.mean(side) for side in by_seed], False
+        _, unit, sign, digits = BESIDE_PID.get(claim, ("", "points", 1, 1))
         if claim in BESIDE_PID:
-            _, sign, digits = BESIDE_PID[claim]
             ours, (pid,) = ([curves.evaluations[""] for curves in side] for side in sides)
             gap, *ends = evaluate.over_seeds([sign * evaluate.paired(trials, pid)[claim][0] for trials in ours])
             low, high = ends if of_both else np.clip(ends, -100, 100)
+        else:
+            gap, low, high = tables.difference("P_scs_percent", *by_seed)
+            apart = tables.separated(*by_seed)
         full = claim == "P_scs_percent" and means[1] >= CEILING
         if not low < high and not (full and low == high):  # a single seed says nothing, nor do seeds without a spread
             continue
         verdict = "holds" if low > -margin else "does not hold" if high < -margin else "cannot be told apart"
         if full and low > -MARGIN:
             verdict = "no room above it" + ", and below" * bool(high < 0)
-        apart = claim not in BESIDE_PID and tables.separated(*by_seed)
         yield {"claim": claim, "task": TITLES[task], "compared": compared, "verdict": verdict, "sides": sides,
                "success": " and ".join(f"{mean:.1f}" for mean in means),
-               "difference": between(gap, low, high, digits) + " †" * apart,
+               "difference": between(gap, low, high, digits) + " †" * apart, "unit": unit,
                "seeds": " and ".join(str(len(side)) for side in sides if not side[0].pid)}  # fmt: skip
 
 
@@ -279,7 +277,7 @@ def beside_pid_lines(runs):
     """Agents beside the PID that they were shown, in the same trials: a line an agent, a column a claim."""
     lines, beside = [["task", "agent", "seeds", "PID's gains", "success (%)", "PID, given longer (%)", "both succeed",
                       *(f"{name}, {('', 'agent minus PID', 'PID minus agent')[sign]}"
-                        for name, sign, _ in BESIDE_PID.values())]], {}  # fmt: skip
+                        for name, _, sign, _ in BESIDE_PID.values())]], {}  # fmt: skip
     for x in findings(runs):
         if x["claim"] in BESIDE_PID:
             beside.setdefault((x["task"], x["compared"]), {})[x["claim"]] = x
@@ -302,10 +300,10 @@ def verdicts_lines(runs):
         for title in lines[0][1:]:
             said = [x for x in found if (x["claim"], x["task"]) == (claim, title)]
             counts = Counter(x["verdict"] for x in said).most_common()
-            cells.append("; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-")
             if len(said) == 1:
-                (x,) = said
-                cells[-1] = f"{x['verdict']}: {x['difference']} {UNITS.get(claim, 'points')}, {x['seeds']} seeds"
+                cells += ["{verdict}: {difference} {unit}, {seeds} seeds".format(**said[0])]
+            else:
+                cells += ["; ".join(f"{verdict} in {n} of {len(said)}" for verdict, n in counts) or "-"]
         lines.append([sentence, *cells])
     return lines
 

@@ -182,6 +182,12 @@ class Curves:
         return self.config.get("own_length", "-epochs=" not in self.folder.name)
 
     @property
+    def own_flags(self):
+        """Whether its symmetry, length and other flags are its recipe's: those of a main group."""
+        own_symmetry = self.row["symmetry"] == OWN_SYMMETRY.get(self.row["recipe"])
+        return own_symmetry and self.own_length and self.row["variant"] == ""
+
+    @property
     def own_success(self):
         """Percent of the own episodes while training that succeeded, exploration and all."""
         return 100 * self.episodes.success.mean()
